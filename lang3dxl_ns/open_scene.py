@@ -79,7 +79,7 @@ def train(
     usual = lang3dxl.config.pipeline.datamanager
     models = clip or usual.clip, dense or usual.dense  # type: ignore[attr-defined]
     steps = lang3dxl.config.max_num_iterations if iterations is None else iterations
-    config = run_config(Path(data), Path(out), expanded(data).absolute().stem, steps, *models)
+    config = run_config(Path(data), Path(out), expanded(data).resolve().stem, steps, *models)
     if scale is not None:
         config.pipeline.datamanager.camera_res_scale_factor = scale
     config.set_timestamp()

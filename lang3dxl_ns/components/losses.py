@@ -1,7 +1,7 @@
-"""Losses of a training step: pure functions that take their mask and return a scalar.
+"""Losses of a training step: pure functions that return a scalar.
 
-Every mean is over the mask, not the image, so that a small building weighs as much as a large one. An
-empty mask gives zero with zero gradient.
+Every mean but the dense loss's is over the mask, not the image, so that a small building weighs as much as a
+large one. An empty mask gives zero with zero gradient.
 """
 
 from __future__ import annotations

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from types import MappingProxyType
 from typing import Any
 
 from lang3dxl_ns.common.errors import UserError
@@ -37,9 +36,9 @@ _GROUPS_OF_RENDERINGS = ("codes", "field_encoding", "field_decoder", "downsample
 """Optimizer groups of such semantics."""
 
 
-def check_inert(model: Any, data: Any, optimizers: Mapping[str, Any] = MappingProxyType({})) -> None:
+def check_inert(model: Any, data: Any, optimizers: Mapping[str, Any] | None = None) -> None:
     """Raise UserError if a setting that has no effect in this run differs from its default. model, data:
-    settings of the model and of the data manager. optimizers: the parameter groups that may differ."""
+    settings of the model and of the data manager. optimizers: those of the parameter groups."""
     changed = [
         *_changed(model, OF_SPLATFACTO, "--pipeline.model."),
         *_changed(data, OF_IMAGE_CACHES, "--pipeline.datamanager."),
@@ -54,7 +53,7 @@ def check_inert(model: Any, data: Any, optimizers: Mapping[str, Any] = MappingPr
     changed += [
         f"--optimizers.{name.replace('_', '-')}"
         for name in _GROUPS_OF_RENDERINGS
-        if optimizers.get(name, default[name]) != default[name]
+        if optimizers is not None and optimizers[name] != default[name]
     ]
     if data.regions not in ("auto", "none"):
         changed.append("--pipeline.datamanager.regions")

@@ -17,7 +17,7 @@ from PIL import ExifTags
 from scipy import ndimage
 
 from lang3dxl_ns.common.console import say
-from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.errors import DAMAGE, UserError
 from lang3dxl_ns.common.files import expanded, read_json, write_atomically
 from lang3dxl_ns.common.pictures import NoPictureError, open_picture
 
@@ -148,12 +148,13 @@ def extract_frames(video: Path, rate: float = FRAMES_PER_SECOND, most: int = MOS
     unless an earlier call did. Raises UserError without ffmpeg, for a file that is no video or a very short
     one, and for a folder with the frames of another video."""
     folder = frames_folder(video)
-    made_of = folder / "video.json"
-    this = [video.name, video.stat().st_size if video.is_file() else None]
+    made_of = folder / "lang3dxl_cache" / "video.json"
+    this = known = [video.name, video.stat().st_size] if video.is_file() else None
     if (folder / "images").is_dir():
-        known = read_json(made_of) if made_of.is_file() else this
-        if this[1] is not None and known != this:
-            raise UserError(f"{folder} holds frames of another video, {known[0]}: rename one, or remove them")
+        with suppress(*DAMAGE):  # frames of an earlier version have no such file
+            known = read_json(made_of)
+        if this is not None and known != this:
+            raise UserError(f"{folder} holds frames of another video: rename {video.name}, or remove them")
         return folder
     if shutil.which("ffmpeg") is None or shutil.which("ffprobe") is None:
         raise UserError(

@@ -22,8 +22,8 @@ import numpy as np
 
 from lang3dxl_ns.common.checks import check_numbers
 from lang3dxl_ns.common.console import progress, say
-from lang3dxl_ns.common.errors import UserError, is_plain
-from lang3dxl_ns.common.files import expanded, locked, write_atomically
+from lang3dxl_ns.common.errors import DAMAGE, UserError, is_plain
+from lang3dxl_ns.common.files import expanded, locked, read_json, write_atomically
 from lang3dxl_ns.common.memory import machine_memory
 from lang3dxl_ns.common.pictures import open_picture
 from lang3dxl_ns.common.reports import measure, part
@@ -126,12 +126,12 @@ def shows_these(work: Path, data: Path) -> bool:
     """Return whether most photos of the reconstruction in `work` are in the folder `data`, by name and size.
     A cache may be another scene's. The answer is also yes if `work` doesn't tell its photos."""
     try:
-        recorded = json.loads((work / _STAMP).read_text())["photos"]
-    except (OSError, ValueError):
+        recorded = {(name, size) for name, size, _ in read_json(work / _STAMP)["photos"]}
+    except DAMAGE:
         return True
     photos = find_photos(data)
     here = {(name, (photos.folder / name).stat().st_size) for name in photos.names}
-    return 2 * sum((name, size) in here for name, size, _ in recorded) > len(recorded)
+    return 2 * len(recorded & here) > len(recorded)
 
 
 def _usable(photos: PhotoFolder) -> tuple[PhotoFolder, dict[str, str]]:

@@ -130,7 +130,7 @@ def test_frames_of_another_video_are_not_taken_for_this_ones(walk, tmp_path):
     video = make_video(walk, tmp_path / "walk.mp4")
     folder = extract_frames(video)
     assert extract_frames(video) == folder
-    with pytest.raises(UserError, match=r"frames of another video, walk\.mp4"):
+    with pytest.raises(UserError, match=r"frames of another video: rename walk\.mov"):
         extract_frames(make_video(walk, tmp_path / "walk.mov"))
     video.write_bytes(video.read_bytes() + b"more")
     with pytest.raises(UserError, match="frames of another video"):
