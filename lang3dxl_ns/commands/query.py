@@ -255,6 +255,8 @@ class Export:
             raise UserError("--not is a negative of texts: give --text too, or leave it off")
         if self.index is not None and (self.out is None or not self.text):
             raise UserError("--index lists the Gaussians that match: give --text and --out with it")
+        if self.settings != QueryConfig() and not self.text and self.web is None:
+            raise UserError("settings of queries have no effect without --text: leave them off, or give one")
         prompts = parse_texts(self.text, self.not_)
         if self.scene_file is not None:
             check_scene_name(self.scene_file)

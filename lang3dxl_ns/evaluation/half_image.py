@@ -35,8 +35,10 @@ class HalfImageProtocol:
     splats: Splats
     field: AppearanceField
     """Appearance field that makes the looks."""
-    metrics: Callable[[Float[Tensor, "h w 3"], Float[Tensor, "h w 3"]], dict[str, float]]
-    """Function that scores a rendering against its photo: `psnr` etc."""
+    metrics: Callable[
+        [Float[Tensor, "h w 3"], Float[Tensor, "h w 3"], Bool[Tensor, "h w"] | None], dict[str, float]
+    ]
+    """Function that scores a rendering against its photo with its mask: `psnr` etc."""
     background: Float[Tensor, "3"]
     """Color behind the scene, 0…1."""
     ssim_weight: float
@@ -58,7 +60,8 @@ class HalfImageProtocol:
         seconds = perf_counter() - start
         settings: dict[str, Any] = {"background": self.background, "backend": self.backend}
         rendering = render_in_look(self.splats, camera, Look(self.field, vector), **settings).rgb
-        scores = self.metrics(rendering[:, middle:], photo[:, middle:])
+        right = None if mask is None else mask[:, middle:]
+        scores = self.metrics(rendering[:, middle:], photo[:, middle:], right)
         return rendering, {f"half_{name}": value for name, value in scores.items()} | {"fit_seconds": seconds}
 
     def fit(

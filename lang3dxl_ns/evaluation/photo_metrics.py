@@ -9,7 +9,7 @@ from pathlib import Path
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from PIL import Image
 from torch import Tensor, nn
 
@@ -48,6 +48,15 @@ class EvaluatedPhoto:
 def psnr(predicted: Float[Tensor, "*shape"], target: Float[Tensor, "*shape"]) -> Float[Tensor, ""]:
     """Compute the peak signal-to-noise ratio in decibels, for a peak of 1."""
     return -10 * torch.log10(F.mse_loss(predicted, target).clamp_min(1e-10))
+
+
+def reached(photo: Float[Tensor, "h w 3"], mask: Bool[Tensor, "h w"] | None) -> Bool[Tensor, "h w"]:
+    """Return which pixels a photo has. Undistortion leaves black where the photo does not reach, outside its
+    mask. A photo that has no pixel at all counts whole."""
+    if mask is None:
+        return torch.ones(photo.shape[:2], dtype=torch.bool, device=photo.device)
+    pixels = mask | (photo > 0).any(-1)
+    return pixels | ~pixels.any()
 
 
 class Lpips:

@@ -11,6 +11,7 @@ from typing import Any, Literal, cast
 
 import torch
 import tyro
+from jaxtyping import Float
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.configs.dataparser_configs import AnnotatedDataParserUnion
 from nerfstudio.data.datamanagers.full_images_datamanager import (
@@ -260,11 +261,12 @@ class Lang3DXLDataManager(FullImageDatamanager):
             dataset.photos[:] = [photos[photo.name] for photo in dataset.photos]
         return photos
 
-    def scene_file(self) -> SceneFile:
-        """Describe the scene for the run's folder: photos, cameras and CLIP."""
+    def scene_file(self, poses: Float[Tensor, "n 3 4"] | None = None) -> SceneFile:
+        """Describe the scene for the run's folder: photos, cameras and CLIP. `poses`: those of the training
+        photos (default: unrefined)."""
         outputs, clip = self.train_dataparser_outputs, self.config.clip
         known = None if clip == "none" else find_model(clip, CLIP_OPTION)
-        trained = self._described(self.train_dataset, "train")
+        trained = self._described(self.train_dataset, "train", poses)
         names = {photo.name for photo in trained}  # with --eval-mode all, the same photos are also held out
         held_out = self._described(self.eval_dataset, "eval")
         return SceneFile(
@@ -276,9 +278,11 @@ class Lang3DXLDataManager(FullImageDatamanager):
             data=str(expanded(self.config.dataparser.data).absolute()),
         )
 
-    def _described(self, dataset: PhotoDataset, split: Literal["train", "eval"]) -> list[ScenePhoto]:
-        poses, photos = dataset.cameras.camera_to_worlds.tolist(), self.photos
-        named = zip((photo.name for photo in dataset.photos), poses, strict=True)
+    def _described(
+        self, dataset: PhotoDataset, split: Literal["train", "eval"], poses: Tensor | None = None
+    ) -> list[ScenePhoto]:
+        poses, photos = dataset.cameras.camera_to_worlds if poses is None else poses, self.photos
+        named = zip((photo.name for photo in dataset.photos), poses.tolist(), strict=True)
         return [ScenePhoto.of(photos[name], split, pose, dataset.scale) for name, pose in named]
 
     @property
@@ -336,7 +340,6 @@ class Lang3DXLDataManager(FullImageDatamanager):
                 rest = [i for i in self.train_unseen_cameras if i != index]
                 self.train_unseen_cameras = rest or self.sample_train_cameras()
                 continue
-            camera.metadata = {"cam_idx": index}
             self.photo_in_hand = batch["name"]
             return camera, batch
 
@@ -370,9 +373,7 @@ class Lang3DXLDataManager(FullImageDatamanager):
         """Yield camera and batch of every training photo once, without the damaged ones."""
         photos = enumerate(self.train_dataset.photos)
         usable = {photo.name for index, photo in photos if index not in self._left_out}
-        for camera, batch in self.evaluated(self.train_dataset, usable):
-            camera.metadata = {"cam_idx": batch["image_idx"]}
-            yield camera, batch
+        yield from self.evaluated(self.train_dataset, usable)
 
     def next_eval_image(self, step: int) -> tuple[Cameras, Batch]:  # type: ignore[override]
         """Return camera and batch of a held-out photo, in turn."""
@@ -432,7 +433,10 @@ class Lang3DXLDataManager(FullImageDatamanager):
             if isinstance(value, Tensor):
                 value = to_device(value, self.device).to(_IN_A_STEP.get(key, value.dtype))
             batch[key] = value
-        return dataset.cameras[index : index + 1], cast(Batch, batch)
+        camera = dataset.cameras[index : index + 1]
+        if dataset is self.train_dataset:  # whose cameras may be refined
+            camera.metadata = {"cam_idx": index}
+        return camera, cast(Batch, batch)
 
 
 def _log(message: str) -> None:

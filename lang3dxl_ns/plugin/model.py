@@ -11,7 +11,7 @@ from typing import Any
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.model_components.lib_bilagrid import color_correct
 from nerfstudio.utils.colors import get_color
@@ -34,7 +34,7 @@ from lang3dxl_ns.components.initialization import (
     seed_positions,
 )
 from lang3dxl_ns.components.learn_codes import TargetView, learn_codes
-from lang3dxl_ns.evaluation.photo_metrics import Lpips, feature_metrics, match, psnr
+from lang3dxl_ns.evaluation.photo_metrics import Lpips, feature_metrics, match, psnr, reached
 from lang3dxl_ns.plugin.model_config import ModelSettings, make_strategy
 from lang3dxl_ns.plugin.optimizers import semantic_ramp
 from lang3dxl_ns.plugin.optional_components import build_components, component_parameters, match_components
@@ -206,7 +206,8 @@ class Lang3DXLModel(RenderingModel):
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
         """Evaluate a held-out photo: PSNR, SSIM, and LPIPS if its weights are available."""
         target, predicted = self.get_gt_img(batch["image"]), outputs["rgb"]
-        metrics = self.image_metrics(predicted, target)
+        mask = batch["mask"][..., 0] if "mask" in batch else None
+        metrics = self.image_metrics(predicted, target, mask)
         images = {"img": torch.cat([target, predicted], dim=1)}
         if "bottleneck" in outputs:
             images["bottleneck"] = outputs["bottleneck"]
@@ -215,17 +216,25 @@ class Lang3DXLModel(RenderingModel):
     @torch.no_grad()
     def corrected_psnr(self, outputs: dict, batch: Batch) -> float:
         """Compute PSNR with matched colors, which takes seconds for a large photo; only `ns-eval` does."""
+        photo = self.get_gt_img(batch["image"])
+        pixels = reached(photo, batch["mask"][..., 0] if "mask" in batch else None)
         # Colors are matched on the CPU, whose solver also handles pictures of a single color.
-        target, predicted = self.get_gt_img(batch["image"]).cpu(), outputs["rgb"].cpu()
+        target, predicted = photo[pixels].cpu(), outputs["rgb"][pixels].cpu()
         return float(psnr(color_correct(predicted, target), target))
 
     @torch.no_grad()
     def image_metrics(
-        self, predicted: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"]
+        self,
+        predicted: Float[Tensor, "h w 3"],
+        target: Float[Tensor, "h w 3"],
+        mask: Bool[Tensor, "h w"] | None = None,
     ) -> dict[str, float]:
-        """Compute `psnr` (dB), `ssim`, and `lpips` if its weights are available."""
+        """Compute `psnr` (dB), `ssim`, and `lpips` if its weights are available, where a photo with a mask
+        reaches."""
+        pixels = reached(target, mask)
+        predicted = torch.where(pixels[..., None], predicted, target)
         chw = [image.permute(2, 0, 1)[None] for image in (target, predicted)]
-        metrics = {"psnr": float(psnr(predicted, target)), "ssim": float(self.ssim(*chw))}
+        metrics = {"psnr": float(psnr(predicted[pixels], target[pixels])), "ssim": float(self.ssim(*chw))}
         perceptual = self.lpips(*chw)
         return metrics if perceptual is None else metrics | {"lpips": perceptual}
 

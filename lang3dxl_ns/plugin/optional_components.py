@@ -66,8 +66,10 @@ def match_components(model: RenderingModel, state: Mapping[str, Any]) -> None:
     directions = state.get("sky.directions")
     if directions is None:
         model.sky = None
-    elif model.sky is None or len(directions) != len(model.sky):
+    elif model.sky is None:
         model.sky = Sky(torch.zeros_like(directions)).to(model.device)
+    else:  # the optimizer holds its colors
+        model.sky.directions = directions.to(model.device)
     model.strategy.still = 0 if model.sky is None else len(model.sky)
     if "camera_optimizer.pose_adjustment" in state and model.config.camera_optimizer.mode == "off":
         build_camera_refinement(model)

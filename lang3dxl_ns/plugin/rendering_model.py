@@ -173,7 +173,8 @@ class RenderingModel(SplatfactoModel):
 
     def seen(self, camera: Cameras, channels: Float[Tensor, "n d"] | None = None) -> Rendering:
         """Render the present Gaussians, and composite further `channels`, from a camera."""
-        view, splats, background = to_rasterizer(camera), self.splats(), self._get_background_color()
+        view, splats = to_rasterizer(camera, self._pose(camera)), self.splats()
+        background = self._get_background_color()
         look = None if self.appearance is None else self.appearance.of_view(view)
         if self.crop_box is not None:
             keep = self.crop_box.within(splats.means).squeeze(-1)
@@ -202,7 +203,7 @@ class RenderingModel(SplatfactoModel):
         return rendering, outputs
 
     def composite(self, camera: Cameras, features: Float[Tensor, "n d"]) -> Float[Tensor, "H W d"]:
-        """Composite values of Gaussians over black in a camera, refined in training like its photo's;
+        """Composite values of Gaussians over black in a camera, refined like its training photo's;
         differentiable only in the values."""
         view = to_rasterizer(camera, self._pose(camera)).detach()
         return composite(self.splats(), view, features, self.backend)
@@ -241,14 +242,20 @@ class RenderingModel(SplatfactoModel):
         return self.learns_from_renderings and self._warm_up_is_over and not self.codes_have_begun
 
     def _pose(self, camera: Cameras) -> Float[Tensor, "3 4"]:
-        """Return camera → world, refined in training. Without refinement the pose stays on the CPU."""
-        pose, metadata = camera.camera_to_worlds[0], camera.metadata or {}
-        if self.training and self.camera_optimizer.config.mode != "off" and "cam_idx" in metadata:
-            index, pose = metadata["cam_idx"], to_device(pose, self.device)
+        """Return camera → world, refined for a training photo. Without refinement the pose stays on the
+        CPU."""
+        poses, metadata = camera.camera_to_worlds, camera.metadata or {}
+        if "cam_idx" in metadata:
             # A slice is used, since an index would be copied to the GPU first.
-            change = self.camera_optimizer(slice(index, index + 1))[0]
-            pose = torch.cat([change[:, :3] @ pose[:, :3], pose[:, 3:] + change[:, 3:]], dim=1)
-        return pose
+            poses = self.refined(poses, slice(metadata["cam_idx"], metadata["cam_idx"] + 1))
+        return poses[0]
+
+    def refined(self, poses: Float[Tensor, "k 3 4"], photos: slice) -> Float[Tensor, "k 3 4"]:
+        """Apply training's corrections to the poses (camera → world) of some training photos."""
+        if self.camera_optimizer.config.mode == "off":
+            return poses
+        poses, change = to_device(poses, self.device), self.camera_optimizer(photos)
+        return torch.cat([change[..., :3] @ poses[..., :3], poses[..., 3:] + change[..., 3:]], dim=2)
 
     def activated(self, g: Mapping[str, Tensor]) -> Gaussians:
         """Activate the parameters `g`, which store log scales and logits of opacity, to Gaussians."""

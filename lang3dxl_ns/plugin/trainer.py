@@ -184,6 +184,11 @@ class Lang3DXLTrainer(Trainer):
         try:
             self._start_step = state["step"] + 1
             self.pipeline.load_pipeline(state["pipeline"], state["step"])
+            if left_out := sorted(set(state["optimizers"]) - set(self.optimizers.optimizers)):
+                raise UserError(
+                    f"{path} was trained with {', '.join(left_out)}, which the present settings leave out: "
+                    "pass the options that the run began with, or train anew"
+                )
             self.optimizers.load_optimizers(state["optimizers"])
             if self.config.load_scheduler:
                 self.optimizers.load_schedulers(state["schedulers"])
@@ -389,10 +394,15 @@ class Lang3DXLTrainer(Trainer):
     def write_scene(self) -> None:
         """Write the trained scene as one file into the run's folder, for queries and sharing. It keeps the
         words taught in an earlier file there, or in the folder of the run that this one resumed."""
-        path = self.base_dir / f"{self.pipeline.datamanager.data_folder.name or 'scene'}{SUFFIX}"
-        config = self.config.pipeline.model
+        data, model = self.pipeline.datamanager, self.pipeline.model
+        path = self.base_dir / f"{data.data_folder.name or 'scene'}{SUFFIX}"
+        config, place = model.config, self.config.load_checkpoint
         how = f"{self.config.method_name}, {config.decoder.name}, {config.total_steps} iterations"
-        scene, place = self.pipeline.model.scene(self.pipeline.scene_file), self.config.load_checkpoint
+        with torch.no_grad():
+            poses = model.refined(data.train_dataset.cameras.camera_to_worlds, slice(None))
+        file = data.scene_file(poses)
+        file.write(self.base_dir / SCENE_FILE)
+        scene = model.scene(file)
         checkpoints = self.config.load_dir or (place and place.parent)
         earlier = sorted(checkpoints.parent.glob(f"*{SUFFIX}")) if checkpoints else []  # may be renamed
         told = Provenance(title=path.stem, made_how=how)
@@ -402,7 +412,7 @@ class Lang3DXLTrainer(Trainer):
             f"The scene:       {os.path.relpath(path)} ({size / 1e6:.1f} MB)",
             f"Walk through it: lang3dxl view {run}",
         )
-        if self.pipeline.model.semantic_field is not None:
+        if model.semantic_field is not None:
             say(f"Ask it:          lang3dxl query {run} --text windows --out found")
 
     def _learn_words(self) -> None:

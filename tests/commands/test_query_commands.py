@@ -136,6 +136,14 @@ def test_export_refuses_options_without_effect(run, tmp_path, target, option):
         run("export", "c", target, tmp_path / name, option, "dome")
 
 
+@pytest.mark.parametrize("target", ["--scene-file", "--out"])
+@pytest.mark.parametrize("option", [("--threshold", 0.9), ("--size", 300), ("--synonyms", "off")])
+def test_export_refuses_settings_of_queries_without_a_text(run, tmp_path, target, option):
+    name = {"--out": "a.ply", "--scene-file": "a.scene"}[target]
+    with pytest.raises(SystemExit, match="settings of queries have no effect without --text"):
+        run("export", "c", target, tmp_path / name, *option)
+
+
 def test_export_writes_the_matching_gaussians_or_all_with_scores(run, tmp_path):
     run("export", "c", "--text", "dome", "--out", tmp_path / "dome.ply")
     domes = int((painted_gaussians()["words"] == 1).sum())

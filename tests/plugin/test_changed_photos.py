@@ -14,7 +14,7 @@ from lang3dxl_ns.methods import lang3dxl
 from lang3dxl_ns.open_scene import train as train_scene
 from lang3dxl_ns.plugin.trainer import Lang3DXLTrainer
 from lang3dxl_ns.plugin.trainer_config import open_run, read_config
-from lang3dxl_ns.query.run_file import SceneFile
+from lang3dxl_ns.query.run_file import SCENE_FILE, SceneFile
 from lang3dxl_ns.query.scene_file import describe_scene_file, read_scene
 from lang3dxl_ns.query.scene_file import write_scene as write_scene_file
 from lang3dxl_ns.query.teach import TaughtWord
@@ -67,7 +67,30 @@ def test_features_are_gathered_at_the_cameras_that_training_refined(train, tmp_p
         model.camera_optimizer.pose_adjustment[camera.metadata["cam_idx"], :3] = 0.5
     refined = model.composite(camera, places)
     assert not torch.allclose(refined, before, atol=0.05)
-    assert torch.allclose(model.eval().composite(camera, places), before, atol=0.05)
+    # An evaluation of photos that training saw looks through the same cameras, and so do scene files.
+    assert torch.equal(model.eval().composite(camera, places), refined)
+
+
+def test_scenes_and_runs_record_the_cameras_that_training_refined(train, tmp_path):
+    data = write_scene(tmp_path / "scene", photos=4, points=60)
+    trainer = train(data, 2, semantics=False, pipeline__model__camera_optimization="on")
+    model, photos = trainer.pipeline.model, trainer.pipeline.datamanager.train_photos()
+    with torch.no_grad():
+        model.camera_optimizer.pose_adjustment[:] = 0.1 * torch.rand(3, 6)
+    trainer.write_scene()
+    recorded = [
+        SceneFile.read(trainer.base_dir / SCENE_FILE),
+        read_scene(trainer.base_dir / "scene.scene").file,
+    ]
+    for camera, batch in photos:
+        pose = model._pose(camera)
+        assert not torch.allclose(pose, camera.camera_to_worlds[0], atol=1e-3)
+        for file in recorded:
+            known = torch.tensor(file.photo(batch["name"]).camera_to_world)
+            torch.testing.assert_close(known, pose, atol=1e-5, rtol=0)
+    (held_out,) = (photo for photo in recorded[0].photos if photo.split == "eval")
+    unrefined = trainer.pipeline.datamanager.eval_dataset.cameras.camera_to_worlds[0]
+    torch.testing.assert_close(torch.tensor(held_out.camera_to_world), unrefined)
 
 
 def test_words_stay_if_the_data_folder_is_renamed(train, tmp_path):

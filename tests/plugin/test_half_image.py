@@ -86,6 +86,32 @@ def test_nothing_of_the_left_half_is_scored(pipeline, photo, monkeypatch):
     assert first["half_psnr"] == pytest.approx(float(expected), abs=1e-3)
 
 
+def test_what_a_photo_does_not_reach_is_not_scored(pipeline, photo, monkeypatch):
+    """Undistortion leaves black corners, which the mask leaves out."""
+    model, (camera, batch) = pipeline.model, photo
+    monkeypatch.setattr(HalfImageProtocol, "fit", lambda *_: model.appearance.vectors[0].detach())
+    cut = batch["image"].shape[0] // 3
+    cornered = {"image": batch["image"].clone(), "mask": torch.ones_like(batch["image"][..., :1]).bool()}
+    cornered["image"][:cut], cornered["mask"][:cut] = 0, False
+    rows = model.get_gt_img(batch["image"])[cut:]
+    outputs = model.get_outputs(camera)
+    expected = float(psnr(outputs["rgb"][cut:], rows))
+    assert expected > float(psnr(outputs["rgb"], model.get_gt_img(cornered["image"]))) + 1
+    metrics, _ = model.get_image_metrics_and_images(outputs, cornered)
+    assert metrics["psnr"] == pytest.approx(expected, abs=1e-3)
+    rest = {"rgb": outputs["rgb"][cut:]}, {"image": batch["image"][cut:]}
+    assert model.corrected_psnr(outputs, cornered) == pytest.approx(model.corrected_psnr(*rest), abs=1e-2)
+    rendering, figures = half_image(model, camera, cornered)
+    right = [halves(picture)[1] for picture in (rendering[cut:], rows)]
+    assert figures["half_psnr"] == pytest.approx(float(psnr(*right)), abs=1e-3)
+
+
+def test_a_black_photo_without_any_pixel_counts_whole(pipeline):
+    black, gray = torch.zeros(30, 40, 3), torch.full((30, 40, 3), 0.1)
+    metrics = pipeline.model.image_metrics(gray, black, torch.zeros(30, 40, dtype=torch.bool))
+    assert metrics["psnr"] == pytest.approx(20.0, abs=1e-3)
+
+
 def test_the_fit_lowers_the_left_halfs_error(pipeline, photo):
     model, (camera, batch) = pipeline.model, photo
     left, _ = halves(batch["image"] / 255)

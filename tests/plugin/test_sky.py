@@ -3,12 +3,14 @@
 import pytest
 import torch
 
+from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.components.initialization import sphere_around
 from lang3dxl_ns.components.sky import OPACITY, Sky
 from lang3dxl_ns.plugin.model import Lang3DXLModel
 from lang3dxl_ns.rendering import Gaussians
 
 COUNT = 200
+ONE_LIGHT = {"pipeline__model__appearance__use": "off"}
 
 
 def some_gaussians(n=300) -> tuple[Gaussians, torch.Tensor]:
@@ -52,8 +54,7 @@ def test_one_smooth_function_reaches_directions_that_no_photo_shows():
 
 
 def trained(train, scene, iterations=20, **changes) -> Lang3DXLModel:
-    one_light = {"pipeline__model__appearance__use": "off"}
-    changes = {"pipeline__model__sky_gaussians": COUNT, **one_light, **changes}
+    changes = {"pipeline__model__sky_gaussians": COUNT, **ONE_LIGHT, **changes}
     return train(scene, iterations=iterations, semantics=False, **changes).pipeline.model
 
 
@@ -86,6 +87,17 @@ def test_without_a_sky_and_with_looks_there_is_nothing_of_it(train, scene, chang
     model = trained(train, scene, 1, **changes)
     assert model.sky is None and "sky" not in model.get_param_groups() and model.strategy.still == 0
     assert not [name for name in model.state_dict() if name.startswith("sky")]
+
+
+def test_a_resumed_run_trains_the_sky_that_it_began_with(train, scene):
+    """Whatever number its settings have; without a sky they contradict the run."""
+    first = train(scene, iterations=4, semantics=False, pipeline__model__sky_gaussians=COUNT, **ONE_LIGHT)
+    place = {"load_dir": first.checkpoint_dir, "iterations": 8, "semantics": False, **ONE_LIGHT}
+    again = train(scene, pipeline__model__sky_gaussians=50, **place).pipeline.model
+    assert len(again.sky) == again.strategy.still == COUNT
+    assert not torch.equal(again.sky.harmonics, first.pipeline.model.sky.harmonics)
+    with pytest.raises(UserError, match="was trained with sky, which the present settings leave out"):
+        train(scene, pipeline__model__sky_gaussians=0, **place)
 
 
 def test_a_checkpoint_brings_a_sky_of_its_own_size_or_none_as_before_it_was_smooth(train, scene):
