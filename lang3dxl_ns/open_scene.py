@@ -100,8 +100,9 @@ def find_scene_file(path: str | Path | None = None) -> Path | None:
     place = OUTPUTS if path is None else expanded(path)
     if place.suffix == SUFFIX or place.is_file():
         return None if place.suffix == ".yml" else place
-    folder = place if any(place.glob(f"*{SUFFIX}")) else find_config(path).parent
-    scenes = sorted(folder.glob(f"*{SUFFIX}"))
+    # Some systems leave a hidden file beside each, such as ._castle.scene.
+    folder = place if any(place.glob(f"[!.]*{SUFFIX}")) else find_config(path).parent
+    scenes = sorted(folder.glob(f"[!.]*{SUFFIX}"))
     if len(scenes) > 1:
         names = ", ".join(file.name for file in scenes[:5])
         raise UserError(f"{place} holds several scenes ({names}): name one of them")

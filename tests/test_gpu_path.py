@@ -337,6 +337,13 @@ def test_export(default, tmp_path, gpu):
         assert scene.export(tmp_path / "tower.ply", "tower", everything=True) == len(scene.splats)
 
 
+def test_a_scene_file_answers_words_that_it_does_not_hold(default, gpu):
+    with gpu():
+        scene = load_scene(default.base_dir)
+        assert next(iter(scene.vectors.values())).device == CUDA
+        scene.ask(["windows", "crooked weather vane"], foreground="building", negatives=["rusty hook"])
+
+
 def test_a_conversation_in_the_viewer(default, gpu):
     from contextlib import nullcontext
 

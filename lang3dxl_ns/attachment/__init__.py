@@ -31,6 +31,6 @@ class AttachConfig(PreparationConfig):
     def check(self) -> None:
         """Raise UserError if a setting is invalid."""
         super().check()
-        check_numbers(self, {"views": (4, 10_000)})
+        check_numbers(self, {"views": (4, 1000)})
         if self.crops == "pyramid" or self.regions not in ("auto", "none"):
             raise UserError("attach learns from fine crops alone: leave --crops and --regions off")

@@ -122,7 +122,7 @@ def attach(
                 scene = segmented(scene, word, segmenter, collection.photos, cameras)
     if place is not None:
         made = f"attached to {path.name} from {len(collection.photos)} {what}"
-        scene, written = replace_scene(place, scene, Provenance(made_how=made))
+        scene, written = replace_scene(place, scene, Provenance(title=place.stem, made_how=made))
         say(f"Wrote {written / 1e6:.1f} MB to {place}")
     return scene
 

@@ -7,6 +7,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
+from heapq import heapify, heappop, heappush
 from pathlib import Path
 
 import numpy as np
@@ -208,11 +209,20 @@ def choose_views(splats: Splats, extent: Extent, count: int) -> list[Camera]:
 def _cover(shown: Float[Tensor, "views n"], count: int) -> list[int]:
     """Choose views greedily. A Gaussian's first pixels count most."""
     total, chosen = torch.zeros_like(shown[0]), list[int]()
-    for _ in range(count):
-        gain = ((total + shown) / _ENOUGH).log1p().sum(1) - (total / _ENOUGH).log1p().sum()
-        gain[chosen] = -math.inf
-        chosen.append(int(gain.argmax()))
-        total = total + shown[chosen[-1]]
+
+    def gain(view: int) -> float:
+        return float((shown[view] / (_ENOUGH + total)).log1p().sum())
+
+    waiting = [(-gain(view), view) for view in range(len(shown))]
+    heapify(waiting)
+    while len(chosen) < count:
+        view = heappop(waiting)[1]
+        # Gains only shrink, so a view that still gains as much as others gained before is the best.
+        if waiting and (now := gain(view)) < -waiting[0][0]:
+            heappush(waiting, (-now, view))
+            continue
+        chosen.append(view)
+        total = total + shown[view]
     return sorted(chosen)
 
 

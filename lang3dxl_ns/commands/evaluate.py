@@ -86,7 +86,9 @@ class EvaluateRun(_Scored):
         from lang3dxl_ns.query.run_file import OUTPUTS
 
         place = self.run or OUTPUTS
-        if place.suffix == ".scene" or (any(place.glob("*.scene")) and not (place / "config.yml").exists()):
+        if place.suffix == ".scene" or (
+            any(place.glob("[!.]*.scene")) and not (place / "config.yml").exists()
+        ):
             return self._score_scene(place)
         from lang3dxl_ns.plugin.trainer_config import open_run
 

@@ -29,7 +29,7 @@ from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.query.scene_file import Provenance, check_scene_name, replace_scene
 from lang3dxl_ns.query.splat_file import check_splat_name
 from lang3dxl_ns.query.teach import run_lengths
-from lang3dxl_ns.query.text import Prompt, caution, parse_prompts
+from lang3dxl_ns.query.text import Prompt, caution, listed_phrases, parse_prompts
 from lang3dxl_ns.query.vocabulary import whole_words
 from lang3dxl_ns.query.web.write_page import Page, write_page
 from lang3dxl_ns.scene.camera import Camera
@@ -96,7 +96,7 @@ class Query:
         prompts = list(question.prompts)
         *folders, shared = (self.out / slug for slug in slugs([*(p.text for p in prompts), "together"]))
         labels, views = CocoLabels([prompt.text for prompt in prompts]), []
-        best = [(-1.0, "")] * len(prompts)
+        best = [(False, -1.0, "")] * len(prompts)
         for name, place, asked in tracked(self._places(scene, question), "rendering"):
             wanted = question if len(asked) == len(prompts) else scene.ask([prompts[i] for i in asked])
             matches = scene.matches(wanted, place)
@@ -105,7 +105,7 @@ class Query:
                 match.save(folders[i] / f"{name}.npy")
                 save_picture(match.mask * np.uint8(255), folders[i] / f"{name}.mask.png")
                 where = f"pixel {match.peak[0]}, {match.peak[1]} of {name}"
-                best[i] = max(best[i], (match.score, where), key=lambda found: found[0])
+                best[i] = max(best[i], (match.area > 0, match.score, where))
             if self.coco is not None and isinstance(place, str):
                 size = scene.file.photo(place).file_size
                 masks = [Image.fromarray(match.mask).resize(size, _NEAREST) for match in matches]
@@ -122,9 +122,9 @@ class Query:
         texts = list(zip(prompts, question.doubts, question.thresholds, folders, strict=True))
         report = {"texts": [_text_report(scene, *text) for text in texts], "views": views}
         write_atomically(listed, json.dumps(report, indent=2, ensure_ascii=False) + "\n")
-        for (prompt, doubt, level, folder), (score, where) in zip(texts, best, strict=True):
+        for (prompt, doubt, _, folder), (matches_there, score, where) in zip(texts, best, strict=True):
             taught = prompt.taught is not None
-            closest = "" if score > level else " (no match; this view comes closest)"
+            closest = "" if matches_there else " (no match; this view comes closest)"
             say(f"{prompt.text}{' (taught)' if taught else ''}: {score:.2f} at {where}; {folder}{closest}")
             warnings = (None if taught else caution(prompt.text), doubtful(prompt.text, doubt, taught))
             say(*(f"  {advice}" for advice in warnings if advice))
@@ -167,21 +167,33 @@ class CocoLabels:
         for category, mask in enumerate(masks, start=1):
             numbers, _ = label(mask)
             for number, place in enumerate(find_objects(numbers), start=1):
-                area = int(np.count_nonzero(numbers[place] == number))
+                part = numbers[place] == number
+                area = int(np.count_nonzero(part))
                 if area < _LEAST_PART * mask.size:
                     continue
                 rows, columns = place
                 box = [columns.start, rows.start, columns.stop - columns.start, rows.stop - rows.start]
-                outline = {"size": [height, width], "counts": run_lengths(numbers == number)}
+                outline = {"size": [height, width], "counts": _runs(part, place, mask.shape)}
                 labeled = {"id": len(annotations) + 1, "image_id": len(images), "category_id": category}
                 found = {"segmentation": outline, "area": area, "bbox": box, "iscrowd": 0}
                 annotations.append({**labeled, **found})
 
 
+def _runs(part: Bool[Array, "r c"], place: tuple[slice, slice], size: tuple[int, ...]) -> list[int]:
+    """Return the `run_lengths` of a mask of this size with one part at a place, from its columns alone."""
+    (rows, columns), (height, width) = place, size
+    runs = run_lengths(np.pad(part, ((rows.start, height - rows.stop), (0, 0))))
+    runs[0] += height * columns.start
+    runs += [0] * (len(runs) % 2 == 0)
+    runs[-1] += height * (width - columns.stop)
+    return runs if runs[-1] else runs[:-1]
+
+
 def parse_texts(texts: Sequence[str], apart_from: Sequence[str] = ()) -> list[Prompt]:
     """Parse the prompts of --text, each once and with the negatives of --not."""
     prompts = dict.fromkeys(prompt for text in texts for prompt in parse_prompts(text))
-    return [replace(prompt, negatives=(*prompt.negatives, *apart_from)) for prompt in prompts]
+    rivals = listed_phrases(apart_from)
+    return [replace(prompt, negatives=(*prompt.negatives, *rivals)) for prompt in prompts]
 
 
 _LONGEST_NAME = 200

@@ -40,16 +40,18 @@ class Teach:
     """Point on what the word means, in pixels of the photo: X,Y. Repeat the flag for more."""
     not_at: tyro.conf.UseAppendAction[list[str]] = field(default_factory=list)
     """Point on something else: X,Y. Repeat the flag for more."""
+    clip: str | None = None
+    """Name or folder of the scene's CLIP, if it is not where the scene file says."""
 
     def main(self) -> None:
-        from lang3dxl_ns.open_scene import existing_scene_file
-        from lang3dxl_ns.query.scene_file import keep_words, read_scene
+        from lang3dxl_ns.open_scene import existing_scene_file, load_scene
+        from lang3dxl_ns.query.scene_file import keep_words
         from lang3dxl_ns.query.teach import known_word
 
         file, name = existing_scene_file(self.scene).resolve(), known_word(self.word)
         example = self._example()
         with locked(file.parent):  # another example that is taught at this moment comes first, or waits
-            scene = read_scene(file)
+            scene = load_scene(file, clip=self.clip)
             before = scene.words[name].examples if name in scene.words else ()
             taught = scene.teach(self.word, [*before, example])
             keep_words(file, {name: taught.words[name]})
@@ -82,15 +84,17 @@ class Words:
     """File to write the words to."""
     load: Path | None = None
     """File of words to add. Words learned in one scene often fail in another, so check them."""
+    clip: str | None = None
+    """Name or folder of the scene's CLIP, if it is not where the scene file says."""
 
     def main(self) -> None:
-        from lang3dxl_ns.open_scene import existing_scene_file
-        from lang3dxl_ns.query.scene_file import describe_scene_file, keep_words, read_scene
+        from lang3dxl_ns.open_scene import existing_scene_file, load_scene
+        from lang3dxl_ns.query.scene_file import describe_scene_file, keep_words
         from lang3dxl_ns.query.teach import known_word, load_words, save_words
 
         if self.save is not None and self.save.suffix != ".json":
             raise UserError(f"--save writes words as JSON: {self.save} is not the name of a .json file")
-        scene = read_scene(file := existing_scene_file(self.scene))
+        scene = load_scene(file := existing_scene_file(self.scene), clip=self.clip)
         before = scene.words
         # The last example of a word goes first, so that the numbers of the others stay as they were listed.
         for name in sorted(set(self.forget), key=lambda which: (len(which), which.lower()), reverse=True):
@@ -99,7 +103,8 @@ class Words:
             for word in load_words(self.load):
                 name, own = known_word(word.name), scene.words
                 scene = scene.carrying(word)
-                if name in own and own[name].examples and not scene.words[name].examples:
+                kept = [example.to_json() for example in scene.words[name].examples]
+                if name in own and any(example.to_json() not in kept for example in own[name].examples):
                     hint = "--forget it too, or rename it in the file"
                     raise UserError(f"{word.name!r} was taught here by examples, which would be lost: {hint}")
         words = list(scene.words.values())

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import functools
+import hashlib
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
 import numba
@@ -20,10 +23,21 @@ def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
     is cached beside the source or in the user's numba folder, or else made anew in every process."""
     try:
         compiled = numba.njit(nogil=True, error_model="numpy", cache=True)(function)
+        # numba looks at the kernel's own file alone, but functions and constants are compiled in from others.
+        with suppress(AttributeError):
+            stored: Any = compiled._cache._cache_file  # type: ignore[attr-defined]
+            stored._source_stamp = stored._source_stamp, _shared_sources()
     except RuntimeError:  # numba raises this if there is no cache folder
         compiled = numba.njit(nogil=True, error_model="numpy")(function)
     _announcement.kernels.add(id(compiled))
     return compiled
+
+
+@functools.cache
+def _shared_sources() -> str:
+    """Hash the sources of the room that most kernels are in."""
+    room = Path(__file__).parents[1] / "rendering"
+    return hashlib.blake2b(b"".join(path.read_bytes() for path in sorted(room.glob("*.py")))).hexdigest()
 
 
 class _Announcement(Listener):

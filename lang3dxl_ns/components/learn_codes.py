@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from lang3dxl_ns.common.console import progress, say, tracked
+from lang3dxl_ns.common.device import in_full_precision
 from lang3dxl_ns.components.feature_decoder import Decoder, Gathered
 from lang3dxl_ns.components.principal_basis import PrincipalBasis
 from lang3dxl_ns.rendering.gathering import Composite, Pixels, gather
@@ -49,6 +50,8 @@ class TargetView:
     """Foreground; None if it is the whole photo."""
 
 
+# A training step's autocast would keep 16-bit copies of the first weights through all steps of the fit.
+@in_full_precision
 def learn_codes(
     decoder: Decoder,
     views: Iterable[TargetView],

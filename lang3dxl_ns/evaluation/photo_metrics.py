@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
+import os
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -40,9 +43,12 @@ class EvaluatedPhoto:
     def write_pictures(self, folder: Path) -> None:
         """Write every picture to `folder` as a JPEG named after the photo."""
         folder.mkdir(parents=True, exist_ok=True)
+        photo = re.sub(r"[^A-Za-z0-9._-]", "_", self.name)[-80:]
+        if photo != self.name:  # photos of two folders may be called alike
+            photo += f".{hashlib.sha256(os.fsencode(self.name)).hexdigest()[:8]}"
         for name, image in self.images.items():
             pixels = (image.clamp(0, 1) * 255).byte().cpu().numpy()
-            Image.fromarray(pixels).save(folder / f"{self.name.replace('/', '_')}.{name}.jpg")
+            Image.fromarray(pixels).save(folder / f"{photo}.{name}.jpg")
 
 
 def psnr(predicted: Float[Tensor, "*shape"], target: Float[Tensor, "*shape"]) -> Float[Tensor, ""]:

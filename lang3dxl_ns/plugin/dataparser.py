@@ -82,7 +82,7 @@ class PhotoCollectionDataParser(ColmapDataParser):
         if not data.is_dir():
             raise UserError(f"{data} is not a folder: pass the one that holds images/ and sparse/0 as --data")
         named = self.config.colmap_path
-        self.config.colmap_path = find_colmap_model(data, (named, *MODEL_FOLDERS, OWN_MODEL)) or named
+        self.config.colmap_path = find_colmap_model(data, _places(named)) or named
         self.config.images_path = images_path(data, self.config.images_path)
         _ = self.reconstruction  # read before the parent looks for anything
         # The parent would require a mask for every photo; here masks are optional and found per photo.
@@ -121,10 +121,11 @@ class PhotoCollectionDataParser(ColmapDataParser):
     def _held_out(self, photos: list[str]) -> list[int]:
         """Return the indices of the listed photos. Raises UserError if one of them doesn't exist."""
         assert self.config.held_out is not None
-        indices = []
+        indices, paths = [], map(PurePosixPath, photos)
+        forms = [{str(path), str(path.with_suffix("")), path.name, path.stem} for path in paths]
         for name in read_names(self.config.held_out):
-            forms = [(p, str(PurePosixPath(p).with_suffix("")), PurePosixPath(p).stem) for p in photos]
-            found = [i for i, known in enumerate(forms) if name in known]
+            found = [i for i, photo in enumerate(photos) if name == photo]
+            found = found or [i for i, known in enumerate(forms) if name in known]
             if len(found) != 1:
                 fits = f"which fits {len(found)} photos of the scene: correct the list"
                 raise UserError(f"{self.config.held_out} names {name}, {fits}")
@@ -279,6 +280,12 @@ def recorded_scene(run: Path | None) -> RecordedSceneDataParserConfig | None:
     return RecordedSceneDataParserConfig(run=run)
 
 
+def _places(named: Path) -> list[Path]:
+    """Return where to look for a model: in the folder that was named, or else in the usual ones."""
+    usual = named == PhotoCollectionDataParserConfig().colmap_path
+    return [named, *MODEL_FOLDERS, OWN_MODEL] if usual else [named]
+
+
 # ── the choice for --data ─────────────────────────────────────────────────────────────────────────────────
 
 
@@ -292,14 +299,14 @@ def parser_for(
     if is_video(data) or (not data.exists() and frames_folder(data).is_dir()):
         data = parser.data = extract_frames(data) if may_reconstruct else frames_folder(data)
     named, usual = parser.colmap_path, type(parser)().colmap_path
-    folders = [named, *MODEL_FOLDERS, OWN_MODEL]
+    folders = _places(named)
     work = None if cache_dir is None else expanded(cache_dir).absolute() / "reconstruction"
-    if work is not None and data.is_dir() and shows_these(work, data):
+    if work is not None and named == usual and data.is_dir() and shows_these(work, data):
         folders.append(work / "sparse/0")
     known = find_colmap_model(data, folders)
     if known is not None:
         parser.colmap_path = known
-    elif (data / TRANSFORMS).is_file():
+    elif named == usual and (data / TRANSFORMS).is_file():
         CONSOLE.log(f"{data} has a {TRANSFORMS} and no COLMAP model: read as nerfstudio-data")
         return NerfstudioDataParserConfig(data=data)
     elif may_reconstruct and named == usual and data.is_dir() and find_photos(data).names:

@@ -78,8 +78,9 @@ class Lang3DXLPipeline(VanillaPipeline):
             if self.model.config.codes_from == "photos":
                 self.learn_words()
             self.model.codes_have_begun = True
-        outputs, self.last_losses, metrics = super().get_train_loss_dict(step)
-        return outputs, self.last_losses, metrics
+        outputs, losses, metrics = super().get_train_loss_dict(step)
+        self.last_losses = {name: loss.detach() for name, loss in losses.items()}
+        return outputs, losses, metrics
 
     @property
     def query(self) -> str:

@@ -277,6 +277,7 @@ class Lang3DXLTrainer(Trainer):
         self.step = max(self._last_iteration, 0)
         if self._start_step < total:
             self.words_are_learned = False  # the checkpoint's words will be out of date
+            self.pipeline.model.forget_gathered_codes()
         try:
             self._announce_time()
             writer.GLOBAL_BUFFER.setdefault("step", self.step)  # the end reads it, also without any step
@@ -322,10 +323,11 @@ class Lang3DXLTrainer(Trainer):
         CONSOLE.log(f"{line}, more if Gaussians multiply")
 
     def train_iteration(self, step: int):
-        result = super().train_iteration(step)
+        loss, losses, metrics = super().train_iteration(step)
         self._last_iteration = step
         self.stages.progress((step + 1 - self._start_step) / self.config.max_num_iterations)
-        return result
+        # nerfstudio keeps these through the next step, and what they were computed from with them.
+        return loss.detach(), {name: value.detach() for name, value in losses.items()}, metrics
 
     @contextmanager
     def _stoppable(self) -> Iterator[None]:
@@ -404,7 +406,7 @@ class Lang3DXLTrainer(Trainer):
         file.write(self.base_dir / SCENE_FILE)
         scene = model.scene(file)
         checkpoints = self.config.load_dir or (place and place.parent)
-        earlier = sorted(checkpoints.parent.glob(f"*{SUFFIX}")) if checkpoints else []  # may be renamed
+        earlier = sorted(checkpoints.parent.glob(f"[!.]*{SUFFIX}")) if checkpoints else []  # may be renamed
         told = Provenance(title=path.stem, made_how=how)
         _, size = replace_scene(path, scene, told, *earlier)
         run = shlex.quote(os.path.relpath(self.base_dir))
@@ -460,7 +462,9 @@ class Lang3DXLTrainer(Trainer):
         if self.config.save_only_latest_checkpoint:
             for other in set(self.checkpoint_dir.glob("*.ckpt")) - {path}:
                 other.unlink()
-        done = self.words_are_learned or not self.pipeline.has_words_to_learn
+        done = step + 1 >= self.config.pipeline.model.total_steps and (
+            self.words_are_learned or not self.pipeline.has_words_to_learn
+        )
         if self._is_ending and not self.interrupted and done:
             self.write_scene()
 

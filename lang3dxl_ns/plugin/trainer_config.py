@@ -25,7 +25,7 @@ from lang3dxl_ns.plugin.inert_settings import check_inert
 from lang3dxl_ns.plugin.optimizers import RunAdamConfig, RunScheduleConfig
 from lang3dxl_ns.plugin.pipeline import Lang3DXLPipeline, Lang3DXLPipelineConfig, print_user_errors_plainly
 from lang3dxl_ns.plugin.trainer import RENDERINGS_PER_STEP, Lang3DXLTrainer, requested_checkpoint
-from lang3dxl_ns.preparation.model_files import check_encoders
+from lang3dxl_ns.preparation.model_files import BUILTIN, check_encoders
 from lang3dxl_ns.preparation.needs import read_needs
 from lang3dxl_ns.query.run_checkpoint import check_checkpoint, latest_checkpoint
 from lang3dxl_ns.query.run_file import SCENE_FILE, find_config
@@ -170,6 +170,11 @@ class Lang3DXLTrainerConfig(TrainerConfig):
         datamanager = self.pipeline.datamanager
         learned = self.pipeline.model.decoder.learns_from_renderings
         datamanager.settle_targets(learned, not learned or self.pipeline.model.codes_from == "photos")
+        for name in ("clip", "dense", "sam", "foreground_model"):
+            choice = getattr(datamanager, name)
+            if choice not in (BUILTIN, "none", "auto") and expanded(choice).is_dir():
+                setattr(datamanager, name, str(_absolute(Path(choice))))
+        datamanager.dataparser.data = expanded(datamanager.dataparser.data).absolute()
         datamanager.data = _absolute(datamanager.data or self.data)
         self.data, datamanager.cache_dir = datamanager.data, _absolute(datamanager.cache_dir)
         self.pipeline.ground_truth = _absolute(self.pipeline.ground_truth)

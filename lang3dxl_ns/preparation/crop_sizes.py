@@ -156,6 +156,8 @@ def _subject_distance(photo: TrackedPhoto, rule: DistanceRule) -> float | None:
     """Compute the distance from the camera to the middle of its tracked points in the camera's frame (a
     per-axis median depends on the frame); None without a usable one. Points behind the camera can't be seen,
     so such tracks are wrong and ignored."""
+    if len(photo.pixels) != len(photo.points):  # points in view, not tracked ones
+        photo = _track_all_in_view(photo.points, photo)
     points = (photo.points - photo.center) @ photo.camera_from_world[:, :3].T
     in_front = points[:, 2] > 0
     points = points[in_front]

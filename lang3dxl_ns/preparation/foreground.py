@@ -13,6 +13,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
+import numpy as np
 import torch
 
 from lang3dxl_ns.common.console import some, tracked
@@ -110,7 +111,7 @@ def _state(photo: Photo) -> bool | str:
     assert photo.mask_path is not None
     try:
         with open_picture(photo.mask_path) as image:
-            return max(gray_values(image).tobytes()) >= 128
+            return bool(np.asarray(gray_values(image)).max() >= 128)
     except (OSError, NoPictureError) as error:
         return f"{photo.mask_path} ({error})"
 
@@ -139,15 +140,12 @@ def _prompted(
         raise UserError("foreground text needs prompts: --pipeline.datamanager.foreground-prompts building")
     files = find_text_segmenter(config.foreground_model, config.sam)
     made_with = {"prompts": sorted(config.foreground_prompts), "model": files.identity, "rule": _RULE}
-    masked, missing = [], []
-    for photo in photos:
-        path = store.path(foreground_kind(config), photo.name).with_suffix(".png")
-        try:
-            settings = json.dumps({**made_with, "photo": photo.content_hash()})
-        except UserError:
-            masked.append(photo)  # reading it later reports the reason
-            continue
-        masked.append(replace(photo, mask_path=path))
+    paths, missing = dict[str, Path](), []
+    for photo, known in zip(photos, store.photo_hashes(photos).values(), strict=True):
+        if isinstance(known, UserError):
+            continue  # reading it later reports the reason
+        paths[photo.name] = path = store.path(foreground_kind(config), photo.name).with_suffix(".png")
+        settings = json.dumps({**made_with, "photo": known})
         if kept_picture(path, settings) is None:
             missing.append((photo, path, settings))
     if missing:
@@ -158,7 +156,8 @@ def _prompted(
             try:
                 image = photo.read_file(_LONGER_SIDE)
             except UserError:
-                continue  # reading it later reports the reason
+                del paths[photo.name]  # reading it later reports the reason
+                continue
             mask = segmenter.segment(image, config.foreground_prompts)
             if not mask.any():
                 empty.append(photo.name)
@@ -166,4 +165,4 @@ def _prompted(
             store.write_bytes(path, mask_png(mask, settings), f"the mask of {photo.name}")
         if empty:
             log(f"found nothing in {len(empty)} photos, which are used whole: {some(empty)}")
-    return masked
+    return [replace(photo, mask_path=paths.get(photo.name)) for photo in photos]

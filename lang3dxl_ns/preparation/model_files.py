@@ -58,7 +58,7 @@ def find_model(name_or_dir: str | Path, option: str) -> ModelFiles:
     is no such folder, the model can't be downloaded, or files are missing."""
     name = str(name_or_dir)
     local = expanded(name)
-    if name == BUILTIN:
+    if name == BUILTIN and option in _BUILTIN_FOLDERS:
         folder = _BUILTIN_FOLDERS[option]
     else:
         folder = local if local.is_dir() else _download(name, option)

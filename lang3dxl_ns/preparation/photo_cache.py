@@ -60,5 +60,7 @@ class PhotoCache:
 
 
 def has_vanished(reason: UserError) -> bool:
-    """Return whether a file was missing or its disk did not answer; errors in its content have no errno."""
-    return isinstance(reason.__cause__, OSError) and reason.__cause__.errno is not None
+    """Return whether a file was missing or its disk did not answer; errors in its content have no errno (nor
+    has safetensors' error for a missing file)."""
+    cause = reason.__cause__
+    return isinstance(cause, FileNotFoundError) or (isinstance(cause, OSError) and cause.errno is not None)

@@ -163,7 +163,9 @@ def _sampled(
     spaced ones of the rest (a Gaussian at an edge may be in both)."""
     words = [one.word.double() / one.word.double().sum() for one in weights]
     rests = [one.rest for one in weights]
-    first, second = (_spaced(torch.stack(parts).sum(0)) for parts in (words, rests))
+    # Of each photo, since the few Gaussians of a click would be lost among those of an outline.
+    most = _ROWS // len(weights)
+    first, second = (torch.cat([_spaced(one, most) for one in parts]).unique() for parts in (words, rests))
     photos = []
     for example, one, word, rest in zip(examples, weights, words, rests, strict=True):
         word = F.pad(word[first], (0, len(second)))
@@ -173,9 +175,9 @@ def _sampled(
     return torch.cat([first, second]), photos
 
 
-def _spaced(weight: Float[Tensor, " n"]) -> Int[Tensor, " m"]:
+def _spaced(weight: Float[Tensor, " n"], most: int) -> Int[Tensor, " m"]:
     rows = (weight > 1e-5 * weight.max()).nonzero().squeeze(1)
-    return rows[:: math.ceil(len(rows) / _ROWS)]
+    return rows[:: math.ceil(len(rows) / most) or 1]
 
 
 def _axes(

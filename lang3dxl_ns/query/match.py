@@ -71,8 +71,8 @@ class Match:
     synonyms: list[str]
     """Synonyms searched along with the prompt."""
     doubt: float
-    """Share of unrelated words that match the scene as well. Above 0.1 the scene probably does not show the
-    prompt, or CLIP does not know it."""
+    """Share of unrelated words that match the scene as well. Above 0.04 (0.1 for a taught word) the scene
+    probably does not show the prompt, or CLIP does not know it."""
     view: View
     relevancy: Float[Array, "h w"]
     """Relevancy of every pixel, 0…1: above 0.5 where the prompt beats all competitors; 0 where nothing is."""

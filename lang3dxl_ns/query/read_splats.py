@@ -73,7 +73,10 @@ def read_splats(path: str | Path) -> Splats:
     if reader is None:
         raise UserError(f"{path.name} names no kind of splat: give {KINDS}")
     try:
-        splats = reader(path)
+        # gsplat on several GPUs leaves a file of each (ckpt_6999_rank1.pt).
+        ranks = re.fullmatch(r"(ckpt_\d+_rank)\d+\.pt", path.name)
+        files = sorted(path.parent.glob(f"{ranks[1]}*.pt")) if ranks else [path]
+        splats = _joined([reader(file) for file in files])
     except ImportError as error:
         raise UserError(f"{path.suffix} files need gsply: pip install 'lang3dxl-ns[share]'") from error
     except UserError as error:
@@ -82,6 +85,13 @@ def read_splats(path: str | Path) -> Splats:
         reason = in_a_line(error)
         raise UserError(f"{path} is damaged or incomplete ({reason}): copy or export it again") from error
     return _finite(splats, path)
+
+
+def _joined(parts: list[Splats]) -> Splats:
+    """Join Gaussians of several files, in their order."""
+    names = ("means", "quats", "scales", "opacities", "harmonics")
+    joined: dict[str, Any] = {name: torch.cat([getattr(part, name) for part in parts]) for name in names}
+    return replace(parts[0], **joined)
 
 
 def _finite(splats: Splats, path: Path) -> Splats:

@@ -33,7 +33,15 @@ from lang3dxl_ns.query.relevancy import Queries
 from lang3dxl_ns.query.run_file import SceneFile, ScenePhoto, overview
 from lang3dxl_ns.query.splat_file import write_index, write_splats
 from lang3dxl_ns.query.teach import Example, TaughtWord, known_word
-from lang3dxl_ns.query.text import EncodeTexts, Prompt, TextEncoder, parse_prompts, taught_prompt, texts_of
+from lang3dxl_ns.query.text import (
+    EncodeTexts,
+    Prompt,
+    TextEncoder,
+    listed_phrases,
+    parse_prompts,
+    taught_prompt,
+    texts_of,
+)
 from lang3dxl_ns.query.visibility import VisibleGaussians, fingerprint, load_visible, save_visible, spread
 from lang3dxl_ns.query.vocabulary import CLEAR, NOTHING, searched, shipped_vocabulary
 from lang3dxl_ns.rendering import Backend, Rendering, Splats, composite
@@ -212,7 +220,7 @@ class Scene:
         requested = self.config.threshold if threshold is None else threshold
         if requested is not None and not 0 <= requested <= 1:
             raise UserError(f"the threshold is {requested}: give a relevancy from 0 to 1")
-        rivals = texts_of(negatives, "a negative")
+        rivals = listed_phrases(texts_of(negatives, "a negative"))
         prompts = [replace(p, negatives=(*p.negatives, *rivals)) for p in self.prompts(texts)]
         within = self.config.foreground if foreground is None else foreground
         everything = [*prompts, *(self.prompts(within) if within else ())]
@@ -532,13 +540,15 @@ class Scene:
         return changed
 
     def carrying(self, word: TaughtWord) -> Scene:
-        """Return a scene with a word taught elsewhere. If it was taught in these photos, it is learned anew;
-        if not, or if its marks no longer show anything, it is kept as it was learned there. Raises UserError
-        if it was learned with another CLIP."""
-        if word.examples and word.scene == Path(self.file.data).name:
-            with suppress(UserError):  # two folders may have one name, with photos of the same names
-                if all(e.size in (None, self.file.photo(e.photo).file_size) for e in word.examples):
-                    return self.teach(word.name, word.examples)
+        """Return a scene with a word taught elsewhere. If it was taught in these photos, of which a few may
+        be gone, it is learned anew; if not, or if its marks no longer show anything, it is kept as it was
+        learned there. Raises UserError if it was learned with another CLIP."""
+        sizes = {photo.name: photo.file_size for photo in self.photos}
+        marked = [e for e in word.examples if e.photo in sizes and e.size in (None, sizes[e.photo])]
+        # Two folders may have one name, with some photos of the same names.
+        if word.scene == Path(self.file.data).name and len(marked) > len(word.examples) / 2:
+            with suppress(UserError):
+                return self.teach(word.name, marked)
         if len(word.vector) != self._semantics()[0].clip_dim or word.clip != self.file.clip_identity:
             raise UserError(f"{word.name!r} was learned with another CLIP than this scene's: teach it anew")
         return self.with_words([*self.words.values(), replace(word, examples=(), precision={})])

@@ -10,7 +10,7 @@ from __future__ import annotations
 import io
 import json
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 from math import prod
 from pathlib import Path
@@ -29,7 +29,7 @@ from lang3dxl_ns.common.checks import expect
 from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.device import best_device
 from lang3dxl_ns.common.errors import DAMAGE, UserError, in_a_line
-from lang3dxl_ns.common.files import expanded, locked, write_atomically
+from lang3dxl_ns.common.files import expanded, locked, slugs, write_atomically
 from lang3dxl_ns.components.appearance import AppearanceConfig, AppearanceField
 from lang3dxl_ns.components.decoders import DecoderConfig, make_decoder
 from lang3dxl_ns.components.feature_decoder import Decoder
@@ -38,7 +38,7 @@ from lang3dxl_ns.query.question import QueryConfig
 from lang3dxl_ns.query.run_file import SceneFile, scene_from_json
 from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.query.splat_file import log_scales, logits
-from lang3dxl_ns.query.teach import TaughtWord, known_word
+from lang3dxl_ns.query.teach import TaughtWord, known_word, save_words
 from lang3dxl_ns.query.text import EncodeTexts
 from lang3dxl_ns.query.vocabulary import common_words
 from lang3dxl_ns.rendering import Splats
@@ -149,11 +149,14 @@ def keep_words(path: Path, words: Mapping[str, TaughtWord | None]) -> None:
 
 def replace_scene(path: Path, scene: Scene, told: Provenance, *earlier: Path) -> tuple[Scene, int]:
     """Write a scene over the file that it replaces, as `write_scene`, with the words taught there and in
-    `earlier` files. Return the written scene and the number of bytes. A command that teaches a word there at
-    this moment comes first, or waits."""
+    `earlier` files, and with its credit and license unless others are told. Return the written
+    scene and the number of bytes. A command that teaches there at this moment comes first, or waits."""
     with locked(path.parent):
         for file in (path, *earlier):
             scene = _with_words_of(scene, file)
+        with suppress(UserError):  # no such file, or a damaged one
+            old = describe_scene_file(path)["provenance"]
+            told = replace(told, credit=told.credit or old.credit, license=told.license or old.license)
         return scene, write_scene(path, scene, told)
 
 
@@ -168,15 +171,21 @@ def _with_words_of(scene: Scene, earlier: Path) -> Scene:
         say(f"Words taught in {earlier.name} are lost: {error}")
         return scene
     for word in words:
-        if (name := known_word(word.name)) in scene.words:
+        name, new = known_word(word.name), scene.words.get(known_word(word.name))
+        if new is not None:
+            if len(new.examples) < len(word.examples):
+                backup = earlier.with_name(f"{earlier.stem}.{slugs([name])[0]}.json")
+                save_words(backup, [word])
+                say(f"The taught word {word.name!r} is replaced; with its examples it is kept in {backup}")
             continue
         try:
             scene = scene.carrying(word)
         except UserError as error:
             say(f"The taught word {word.name!r} is lost: {error}")
             continue
-        count = len(scene.words[name].examples)
+        count, all_ = len(scene.words[name].examples), len(word.examples)
         how = f"learned anew from its examples ({count})" if count else "as it was: check it in a few photos"
+        how += f"; the photos of {all_ - count} others are not those of before" if 0 < count < all_ else ""
         say(f"The taught word {word.name!r} is kept, {how}")
     return scene
 
@@ -228,6 +237,7 @@ def read_scene(
     background = None if file.background is None else torch.tensor(file.background, device=device)
     # Moved to the device here, where its errors are not the file's.
     codes = None if codes is None else codes.to(device)
+    vectors = None if vectors is None else {word: vector.to(device) for word, vector in vectors.items()}
     return Scene(
         splats.to(device), replace(file.scene, photos=photos), decoder and decoder.to(device), codes,
         looks=looks and looks.to(device), background=background, config=config or QueryConfig(),

@@ -95,7 +95,11 @@ def _spz(splats: Splats) -> bytes:
     means, scales, turned, opacities, base, rest = (np.array(array_of(part)) for part in parts)
     data = gsply.GSData(means, scales, turned, opacities, base, rest)
     farthest = float(splats.means.abs().max()) if len(splats) else 0.0
-    bits = int(np.clip(np.floor(22 - np.log2(max(farthest, 1e-3))), 1, 20))
+    bits = int(min(np.floor(22 - np.log2(max(farthest, 1e-3))), 20))
+    if bits < 0:
+        raise UserError(
+            f".spz holds coordinates up to 4 million, and these reach {farthest:,.0f}: write a .ply"
+        )
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "scene.spz"
         gsply.write_spz(path, data, fractional_bits=bits)

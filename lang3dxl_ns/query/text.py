@@ -97,6 +97,12 @@ def tidy(text: str) -> str:
     return " ".join(text.replace('"', " ").replace("\0", " ").split())
 
 
+def listed_phrases(texts: Iterable[str]) -> list[str]:
+    """Return the phrases of texts that may list several, separated by `;` or commas, quoted or not."""
+    parts = (re.findall(rf"{_QUOTED}|[^;,]+", text.translate(_CURLY_QUOTES)) for text in texts)
+    return [phrase for found in parts for part in found if (phrase := tidy(part))]
+
+
 # ── what CLIP can't tell ────────────────────────────────────────────────────────────────────────────────
 
 _COLORS = "red|orange|yellow|green|blue|purple|pink|brown|black|white|gray|grey|golden"
@@ -204,6 +210,8 @@ class TextEncoder:
         """Encode texts as unit vectors."""
         texts = texts_of(texts, "what is encoded")
         with self._lock:  # two threads can't use a tokenizer at once
+            small = {text: self._vectors[text.lower()] for text in texts if text.lower() in self._vectors}
+            self._vectors = small | self._vectors  # so that a capital letter needs no CLIP
             new = [text for text in dict.fromkeys(texts) if text not in self._vectors]
             if new:
                 self._vectors |= zip(new, F.normalize(self._encode(new), dim=-1), strict=True)

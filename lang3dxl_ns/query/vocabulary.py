@@ -61,14 +61,18 @@ def competitors(phrases: Sequence[str], words: Sequence[str]) -> list[int]:
     """Return the indices of the phrases that a prompt competes with: those that neither it nor its synonyms
     (`words`) name, by any of their words or the synonyms of these, singular or plural. If all phrases are
     named, all compete."""
-    named = {form for text in words for word in text.lower().split() for form in singulars(word)}
+    named = {form for text in words for word in _words(text) for form in singulars(word)}
     chosen = [i for i, phrase in enumerate(phrases) if not named & _meanings(phrase)]
     return chosen or list(range(len(phrases)))
 
 
 def _meanings(phrase: str) -> set[str]:
-    own = [form for word in phrase.lower().split() for form in singulars(word)]
+    own = [form for word in _words(phrase) for form in singulars(word)]
     return {*own, *(word for form in own for word in _NAMED.get(form, ()))}
+
+
+def _words(text: str) -> list[str]:
+    return re.split(r"[\s/-]+", text.lower())
 
 
 def singulars(words: str) -> list[str]:
@@ -88,7 +92,7 @@ def synonym_table() -> dict[str, list[str]]:
 
 def synonyms_of(text: str) -> list[str]:
     """Return synonyms of a term in singular or plural, with or without an article; none for other texts."""
-    words, table = re.sub(r"^(an?|the)\s+", "", known_word(text)), synonym_table()
+    words, table = re.sub(r"^(an?|the)\s+", "", known_word(text.replace("-", " "))), synonym_table()
     return next((table[form] for form in singulars(words) if form in table), [])
 
 
@@ -104,13 +108,15 @@ _WHERE = re.compile(
     rf"|^(?:(?:the|a)\s+)?(?:{_PLACES}|{_SIZES})\s+(?!of\b)(?=\S)",
     re.IGNORECASE,
 )
+_NAME = re.compile(r"(The )?[A-Z]\w* [A-Z]\w*")
 _WHOLE = re.compile(r"(?P<end>[a-z]{3,})</w>|[▁Ġ](?P<start>[a-z]{3,})")
 """Pattern of tokens that are whole words: CLIP's tables mark their end, others mark their start."""
 
 
 def searched(text: str) -> str:
-    """Remove words that select by place or size: *windows on the left tower* becomes *windows*."""
-    return _WHERE.sub("", text).strip() or text
+    """Remove words that select by place or size: *windows on the left tower* becomes *windows*. A name such
+    as *Big Ben* stays."""
+    return text if _NAME.match(text) else _WHERE.sub("", text).strip() or text
 
 
 @cache

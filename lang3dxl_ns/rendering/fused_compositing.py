@@ -52,11 +52,12 @@ _kept = _Kept()
 
 
 class FusedCompositing(torch.autograd.Function):
-    """Compositing as in `torch_rasterizer.Compositing`, compiled. The variances get no gradient."""
+    """Compositing as in `torch_rasterizer.Compositing`, compiled. As there, an ellipse's shape depends on
+    xx and xy of its conic and on its variance yy, and only these get the shape's gradient."""
 
     @staticmethod
     def forward(ctx: Any, *inputs: Any) -> tuple[Tensor, Tensor]:  # type: ignore[override]
-        plan, (means2d, conics, opacities, channels, *_) = make_plan(*inputs), inputs
+        plan, (means2d, conics, opacities, channels, variances, *_) = make_plan(*inputs), inputs
         ctx.sizes = channels.shape[1], 1
         maps = tuple(channels.new_empty(plan.height, plan.width, size) for size in ctx.sizes)
         rows, keep = np.diff(plan.starts), any(ctx.needs_input_grad)
@@ -66,7 +67,7 @@ class FusedCompositing(torch.autograd.Function):
         trace = Trace(wave_starts, records, np.zeros(len(rows), np.int64))
         shared = plan, Maps(*(part.numpy() for part in maps)), trace, keep
         in_threads(composite_tiles, [(tiles, *shared) for tiles in _parts(rows)])
-        ctx.save_for_backward(means2d, conics, opacities)
+        ctx.save_for_backward(means2d, conics, opacities, variances)
         ctx.set_materialize_grads(False)
         ctx.plan, ctx.trace = plan, trace
         return maps[0], maps[1]
@@ -74,7 +75,7 @@ class FusedCompositing(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *upstream: Tensor | None) -> Any:  # type: ignore[override]
-        means2d, conics, opacities = ctx.saved_tensors
+        means2d, conics, opacities, variances = ctx.saved_tensors
         plan, positions = ctx.plan, means2d.view(-1, 2)
         slopes = (
             opacities.new_zeros(plan.height, plan.width, size) if slope is None else slope.contiguous()
@@ -89,10 +90,11 @@ class FusedCompositing(torch.autograd.Function):
         sums = _kept.take((len(dealt), len(plan.order), columns), plan.splats.dtype)
         in_threads(backward_tiles, [(tiles, plan, maps, ctx.trace, sums[k]) for k, tiles in enumerate(dealt)])
         found = [torch.zeros_like(part) for part in (positions, conics, opacities)]
-        found.append(opacities.new_zeros(len(opacities), ctx.sizes[0]))
-        arrays = plan, conics.numpy(), opacities.numpy(), sums, _Gradients(*(g.numpy() for g in found))
+        found += [opacities.new_zeros(len(opacities), ctx.sizes[0]), torch.zeros_like(variances)]
+        shapes = (part.numpy() for part in (conics, variances, opacities))
+        arrays = plan, *shapes, sums, _Gradients(*(g.numpy() for g in found))
         in_threads(_collect, [(*part, *arrays) for part in ranges(len(plan.order), least=4096)])
-        return found[0].view_as(means2d), *found[1:], *[None] * 4
+        return found[0].view_as(means2d), *found[1:], *[None] * 3
 
 
 class _Gradients(NamedTuple):
@@ -102,6 +104,7 @@ class _Gradients(NamedTuple):
     conic: Float[np.ndarray, "n 3"]
     opacity: Float[np.ndarray, " n"]
     channels: Float[np.ndarray, "n c"]
+    variances: Float[np.ndarray, "n 2"]
 
 
 def _parts(work: np.ndarray) -> list[np.ndarray]:
@@ -114,18 +117,23 @@ def _parts(work: np.ndarray) -> list[np.ndarray]:
 
 
 @kernel
-def _collect(first, last, plan, conics, opacities, sums, found) -> None:
-    """Collect the gradients of a range of Gaussians from the sums of all threads."""
+def _collect(first, last, plan, conics, variances, opacities, sums, found) -> None:
+    """Collect the gradients of a range of Gaussians from the sums of all threads. With a and b the conic's xx
+    and xy, ln(alpha) is ln(opacity) − (a·u² + dy² / variance) / 2, where u = dx + b / a · dy."""
     row = np.empty(sums.shape[2], sums.dtype)
     for rank in range(first, last):
         row[:] = sums[0, rank]
         for part in range(1, len(sums)):
             row += sums[part, rank]
+        if not row.any():  # no pixel shows it, perhaps because its variance is 0, by which 0 would be divided
+            continue
         g = plan.order[rank]
-        a, b, c = conics[g, 0], conics[g, 1], conics[g, 2]
-        found.conic[g, 0], found.conic[g, 1], found.conic[g, 2] = -0.5 * row[0], -row[1], -0.5 * row[2]
+        shear, variance = plan.splats[rank, 2], variances[g, 1]
+        found.conic[g, 0], found.conic[g, 1] = shear * row[1] - 0.5 * row[0], -row[1]
+        found.variances[g, 1] = 0.5 * row[2] / variance / variance
         # dx and dy point from the center to the pixel.
-        found.position[g, 0], found.position[g, 1] = a * row[3] + b * row[4], b * row[3] + c * row[4]
+        found.position[g, 0] = conics[g, 0] * row[3]
+        found.position[g, 1] = conics[g, 1] * row[3] + row[4] / variance
         found.opacity[g] = row[5] / opacities[g]
         for k in range(found.channels.shape[1]):
             found.channels[g, k] = row[CHANNELS_FROM + k]

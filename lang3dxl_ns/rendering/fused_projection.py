@@ -57,7 +57,7 @@ class Lens(NamedTuple):
 def project(
     gaussians: Gaussians, camera: Camera, *, near: float, eps2d: float, antialiased: bool
 ) -> Ellipses:
-    """Project Gaussians as `projection.project` does. Neither intrinsics nor variances carry gradients."""
+    """Project Gaussians as `projection.project` does. Intrinsics get no gradient."""
     count = len(gaussians.means)
     parts = [gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities]
     if count < LANES:  # at least one full vector; the padding is not visible
@@ -92,7 +92,7 @@ class _Screen(NamedTuple):
     conics: Float[np.ndarray, "n 3"]
     depths: Float[np.ndarray, " n"]
     opacities: Float[np.ndarray, " n"]
-    variances: Float[np.ndarray, "n 2"] | None = None
+    variances: Float[np.ndarray, "n 2"]
     radii: Int[np.ndarray, " n"] | None = None
 
 
@@ -107,7 +107,7 @@ class _Projection(torch.autograd.Function):
         in_threads(_project, [(*part, *arrays) for part in _vectors(count)])
         ctx.lens = lens
         ctx.save_for_backward(*inputs)
-        ctx.mark_non_differentiable(*found[4:])
+        ctx.mark_non_differentiable(found[5])
         ctx.set_materialize_grads(False)
         return tuple(found)
 
@@ -118,7 +118,7 @@ class _Projection(torch.autograd.Function):
         count = len(inputs[0])
         slopes = [
             inputs[0].new_zeros(count, *shape) if part is None else part.contiguous()
-            for part, shape in zip(upstream[:4], ((2,), (3,), (), ()), strict=True)
+            for part, shape in zip(upstream[:5], ((2,), (3,), (), (), (2,)), strict=True)
         ]
         found = [torch.empty_like(part) for part in inputs[:4]]
         world, gradients = (_World(*(part.numpy() for part in arrays)) for arrays in (inputs, found))
@@ -308,7 +308,7 @@ def _backward(first, last, world, lens, upstream, found, g_view):
     for start in range(first, last, LANES):
         g = min(start, len(world.means) - LANES)
         v = _look(world, lens, g)
-        g_row_x, g_row_y = _to_rows(world, lens, upstream, found, v, g, zero)
+        g_row_x, g_row_y = _to_rows(world, lens, upstream, found, v, g)
 
         # Next: gradients of the camera's axes and of the point in its frame.
         g_right, g_down = _scaled(g_row_x, lens.focal_x / v.z), _scaled(g_row_y, lens.focal_y / v.z)
@@ -337,27 +337,30 @@ def _backward(first, last, world, lens, upstream, found, g_view):
 
 
 @numba.njit(forceinline=True)
-def _to_rows(world, lens, upstream, found, v, g, zero):
+def _to_rows(world, lens, upstream, found, v, g):
     """Store the gradients of opacities, scales and quaternions, and return those of the Jacobian's rows."""
     determinant = maximum(v.determinant, _DETERMINANT_MIN)
-    # From conic and opacity to the covariance, its determinant and the area of the sharp ellipse.
+    # From conic, variances and opacity to the covariance, its determinant and the area of the sharp ellipse.
     c0, c1, c2 = _load3(upstream.conics, g)
     g_alpha = where(v.drawable, load(upstream.opacities, g), 0.0)
     g_xx, g_yy, g_xy = c2 / determinant, c0 / determinant, c1 * -1.0 / determinant
-    g_determinant = (c0 * v.yy - c1 * v.xy + c2 * v.xx) * -1.0 / (determinant * determinant)
-    g_area2 = zero
+    # The determinant is area2 plus what blur adds. The gradients of both are computed times the determinant.
+    # Without that factor, they would underflow for huge ellipses, whose determinant's square overflows.
+    free = v.determinant >= _DETERMINANT_MIN
+    g_area2 = g_added = where(free, (c0 * v.yy - c1 * v.xy + c2 * v.xx) * -1.0 / determinant, 0.0)
     if lens.antialiased > 0:
         ratio = sqrt(v.area2 / determinant)
-        g_ratio = g_alpha * load(world.opacities, g)
-        g_determinant -= g_ratio * ratio * 0.5 / determinant
-        # The area's own gradient. It is zero where the area is 0, as for a vector's length.
-        g_area2 = where(v.area2 > 0.0, g_ratio * 0.5 / (sqrt(v.area2) * sqrt(determinant)), 0.0)
+        half = g_alpha * load(world.opacities, g) * 0.5
+        added = where(free, (v.xx + v.yy - lens.eps2d) * lens.eps2d, determinant)
+        g_added -= where(free, half * ratio, 0.0)
+        # The derivative of ln(area2 / determinant) by ln(area2) is added / determinant: nothing cancels.
+        # The gradient of the area is zero where the area is 0, as for a vector's length.
+        g_area2 += where(v.area2 > 0.0, half * added / (sqrt(v.area2) * sqrt(determinant)), 0.0)
         g_alpha *= ratio
     store(found.opacities, g, g_alpha)
-    g_determinant = where(v.determinant >= _DETERMINANT_MIN, g_determinant, 0.0)
-    g_xx += g_determinant * lens.eps2d
-    g_yy += g_determinant * lens.eps2d
-    g_normal = _scaled(v.normal, (g_determinant + g_area2) * 2.0)
+    g_xx += g_added / determinant * lens.eps2d + load_column(upstream.variances, g, 0)
+    g_yy += g_added / determinant * lens.eps2d + load_column(upstream.variances, g, 1)
+    g_normal = _scaled(_scaled(v.normal, 2.0 / determinant), g_area2)
 
     # From there to the scaled axes, the scales, the rotation and the rows of the Jacobian.
     g_axes_x = _plus(_scaled(v.axes_x, g_xx * 2.0), _scaled(v.axes_y, g_xy))

@@ -41,8 +41,9 @@ UNROLL = 4
 WAVE = 32
 PIXELS = TILE * TILE
 CHANNELS_FROM = 6
-"""First channel column of a row's gradients. The six columns before it are the conic (xx, xy, yy), first
-moments (x, y), and ln opacity."""
+"""First channel column of a row's sums. In the six columns before it, the gradient with respect to ln(alpha)
+is summed, times u², u·dy, dy², u, dy and 1, where u = dx + shear·dy. Unlike dx, u is small along a needle,
+so that nothing cancels in float32."""
 _BLOCKS = PIXELS // LANES
 _BLOCK_WIDTH, _BLOCK_HEIGHT = 8, 2
 _REACH = math.log2(ALPHA_MIN) - 0.01  # with a margin for rounding
@@ -317,8 +318,8 @@ def _add_values(plan, upstream, rank, first, last, found):
 
 @numba.njit(forceinline=True)
 def _add_shape(across, down, splat, first, last, found, behind, zero, sums):
-    """Add the gradients of a row's conic, moments and opacity, and move `behind` in front of it."""
-    m, mx, my, mxx, mxy, myy = zero, zero, zero, zero, zero, zero
+    """Add the moments of a row's gradients (see `CHANNELS_FROM`), and move `behind` in front of it."""
+    m, mu, my, muu, muy, myy = zero, zero, zero, zero, zero, zero
     for slot in range(first, last):
         at = entry(found.places, slot)
         dx, dy = load(across, at) - splat.x, load(down, at) - splat.y
@@ -326,17 +327,18 @@ def _add_shape(across, down, splat, first, last, found, behind, zero, sums):
         over = load(found.values, slot * LANES) - back
         store(behind, at, back + alpha * over)
         slope = where(alpha < ALPHA_MAX, load(found.weights, slot * LANES) * over, 0.0)
-        slope_x, slope_y = slope * dx, slope * dy
+        slanted = dx + dy * splat.shear
+        slope_u, slope_y = slope * slanted, slope * dy
         m += slope
-        mx += slope_x
+        mu += slope_u
         my += slope_y
-        mxx += slope_x * dx
-        mxy += slope_x * dy
+        muu += slope_u * slanted
+        muy += slope_u * dy
         myy += slope_y * dy
-    sums[0] += total(mxx)
-    sums[1] += total(mxy)
+    sums[0] += total(muu)
+    sums[1] += total(muy)
     sums[2] += total(myy)
-    sums[3] += total(mx)
+    sums[3] += total(mu)
     sums[4] += total(my)
     sums[5] += total(m)
 

@@ -81,7 +81,7 @@ class Ellipses:
     conics: Float[Tensor, "n 3"]
     """Inverse covariances (xx, xy, yy), pixels⁻²."""
     variances: Float[Tensor, "n 2"]
-    """Diagonal of the covariances (xx, yy), pixels². The compiled kernels give it no gradient."""
+    """Diagonal of the covariances (xx, yy), pixels²."""
     depths: Float[Tensor, " n"]
     """Distance along the camera's z axis, world units."""
     opacities: Float[Tensor, " n"]

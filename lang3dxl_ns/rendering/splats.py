@@ -101,7 +101,7 @@ def render(
     if background is not None:
         behind[:3] = background
     raster = rasterize(
-        splats.seen_from(camera), camera, carried, behind,
+        splats.gaussians.seen_from(camera), camera, carried, behind,
         render_depth=True, antialiased=splats.antialiased, backend=backend,
     )  # fmt: skip
     assert raster.depth is not None
@@ -115,5 +115,5 @@ def composite(
     splats: Splats, camera: Camera, channels: Float[Tensor, "n d"], backend: Backend = "auto"
 ) -> Float[Tensor, "h w d"]:
     """Composite values of the Gaussians over black, differentiable in the values, without their colors."""
-    seen = splats.seen_from(camera)
+    seen = splats.gaussians.seen_from(camera)
     return rasterize(seen, camera, channels, antialiased=splats.antialiased, backend=backend).image

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import subprocess
 from contextlib import suppress
@@ -29,6 +30,8 @@ _NOT_PHOTOS = {
     *("masks", "mask", "segments", "depth", "depths", "normals", "ground_truth", "labels", "sparse", "dense"),
     *("lang3dxl_cache", "outputs", "renders", "colmap", "images_2", "images_4", "images_8"),
 }
+_OWN = re.compile(r"\.[0-9a-f]{16}\.(png|jpg)$")
+"""Ends of the names of pictures in a feature store, which --cache-dir may put into the photos' folder."""
 
 
 @dataclass(frozen=True)
@@ -75,7 +78,7 @@ def readable(photos: PhotoFolder) -> tuple[PhotoFolder, dict[str, str]]:
             continue
         try:
             with open_picture(path) as image:
-                image.verify()
+                image.load() if image.format == "GIF" else image.verify()  # which reads nothing of a GIF
             good.append(name)
         except (OSError, NoPictureError) as error:
             bad[name] = f"the file is damaged ({error})"
@@ -87,9 +90,12 @@ def photos_below(folder: Path) -> list[str]:
     names = []
     for parent, folders, files in os.walk(folder):
         folders[:] = [f for f in folders if f.lower() not in _NOT_PHOTOS and not f.startswith((".", "_"))]
+        if Path(parent).name == "reconstruction":
+            folders[:] = [f for f in folders if f != "numbered"]
         for file in files:
             path = Path(parent, file)
-            if path.suffix.lower() in (*PHOTO_SUFFIXES, *UNREADABLE_SUFFIXES) and not file.startswith("."):
+            known = path.suffix.lower() in (*PHOTO_SUFFIXES, *UNREADABLE_SUFFIXES)
+            if known and not file.startswith(".") and not _OWN.search(file):
                 names.append(path.relative_to(folder).as_posix())
     return sorted(names)
 
@@ -118,6 +124,7 @@ _LOOK = (240, 135)  # pixels at which sharpness is judged; motion blur is visibl
 
 _READING = ("-v", "error", "-protocol_whitelist", "file", "-format_whitelist", "mov,matroska,avi,mpegts,mpeg")
 """Options of ffmpeg for untrusted files: a playlist, for example, could name other files and addresses."""
+_SILENT = subprocess.DEVNULL  # ffmpeg takes what is typed, or a script's own input, for commands
 
 
 def _reading(program: str, video: Path) -> list[str]:
@@ -184,7 +191,7 @@ def _sharpness(video: Path) -> Float[Array, " n"]:
     command = [*_reading("ffmpeg", video), "-an", "-vf", f"scale={width}:{height}"]
     command += ["-fps_mode", "passthrough", "-f", "rawvideo", "-pix_fmt", "gray", "-"]
     values = []
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL) as process:
+    with subprocess.Popen(command, stdin=_SILENT, stdout=subprocess.PIPE, stderr=_SILENT) as process:
         assert process.stdout is not None
         while len(frame := process.stdout.read(width * height)) == width * height:
             gray = np.frombuffer(frame, np.uint8).reshape(height, width).astype(np.float32)
@@ -195,7 +202,7 @@ def _sharpness(video: Path) -> Float[Array, " n"]:
 def _duration(video: Path) -> float:
     asked = ("-select_streams", "v:0", "-show_entries", "stream=codec_type:format=duration", "-of", "json")
     command = [*_reading("ffprobe", video), *asked]
-    found = subprocess.run(command, capture_output=True, text=True, check=False)
+    found = subprocess.run(command, stdin=_SILENT, capture_output=True, text=True, check=False)
     try:
         answer = json.loads(found.stdout)
         if not answer["streams"]:
@@ -213,7 +220,7 @@ def _write(video: Path, folder: Path, chosen: Int[Array, " s"]) -> None:
     wanted = "+".join(f"eq(n,{index})" for index in chosen)
     command = [*_reading("ffmpeg", video), "-an", "-vf", f"select='{wanted}'"]
     command += ["-fps_mode", "passthrough", "-q:v", "2", str(partial / "frame_%05d.jpg")]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    done = subprocess.run(command, stdin=_SILENT, capture_output=True, text=True, check=False)
     if done.returncode or not any(partial.iterdir()):
         raise UserError(f"ffmpeg can't write frames of {video} to {folder}: {done.stderr.strip()}")
     partial.rename(folder / "images")

@@ -142,3 +142,14 @@ def interrupt(*_):
 
 def choose_first(extent):
     return list(candidates(extent, views._FreeSpace(solids(SPLATS), extent), 2))
+
+
+def test_views_are_those_of_the_plain_greedy_choice():
+    shown = 20 * torch.rand(30, 200, generator=torch.Generator().manual_seed(0)) ** 8
+    total, chosen = torch.zeros(200), []
+    for _ in range(8):
+        gains = (shown / (views._ENOUGH + total)).log1p().sum(1)
+        gains[chosen] = -1
+        chosen.append(int(gains.argmax()))
+        total = total + shown[chosen[-1]]
+    assert views._cover(shown, 8) == sorted(chosen)

@@ -127,6 +127,14 @@ def test_photos_to_reconstruct_are_of_the_named_formats_too(tmp_path):
     assert "formats JPEG" in bad["b.jpg"] and "not a file" in bad["c.jpg"]
 
 
+def test_a_gif_that_ends_early_is_not_reconstructed_from(tmp_path):
+    Image.effect_noise((40, 30), 90).save(tmp_path / "a.gif")
+    content = (tmp_path / "a.gif").read_bytes()
+    (tmp_path / "b.gif").write_bytes(content[: len(content) // 2])
+    good, bad = readable(find_photos(tmp_path))
+    assert good.names == ("a.gif",) and "damaged" in bad["b.gif"]
+
+
 def test_damaged_exif_is_no_exif(tmp_path):
     for i, tail in enumerate((b"", b"II*\0" + b"\xff" * 40, b"MM\0*\0\0\0\x08\xff\xff" + b"\1" * 60)):
         Image.new("RGB", (40, 30)).save(tmp_path / f"{i}.jpg", exif=b"Exif\0\0" + tail)
@@ -267,12 +275,13 @@ def during(trainer, step, what):
     trainer.train_iteration = train_iteration
 
 
-def test_photos_that_vanish_end_the_training_with_a_checkpoint(training, tmp_path):
+def test_photos_that_vanish_end_the_training_with_a_checkpoint_and_no_scene(training, tmp_path):
     trainer, photos = training
     during(trainer, 11, lambda: photos.rename(tmp_path / "gone"))
     with pytest.raises(UserError, match=r"2 of 7 training photos.*Stopped after 11 iterations.*--load-dir"):
         trainer.train()
     assert [path.name for path in trainer.checkpoint_dir.iterdir()][-1:] == ["step-000000010.ckpt"]
+    assert not list(trainer.base_dir.glob("*.scene"))
 
 
 def test_photos_that_come_back_are_waited_for(training, tmp_path, monkeypatch, capsys):

@@ -244,6 +244,8 @@ def test_the_token_opens_the_page_once_and_leaves_the_address(wide):
     answer = get(wide, f"/?token={access.token}")
     assert (answer.status, answer.headers["Location"]) == (303, "/")
     assert "HttpOnly" in answer.headers["Set-Cookie"]
+    # A link that is clicked in a chat on the web opens the page, and Strict would not.
+    assert "SameSite=Lax" in answer.headers["Set-Cookie"]
     cookie = {"Cookie": answer.headers["Set-Cookie"].split(";")[0]}
     assert get(wide, "/", **cookie).status == 200
     assert get(wide, "/../../_viser.py", **cookie).status == 404

@@ -10,7 +10,7 @@ from PIL import Image
 
 from lang3dxl_ns import cli
 from lang3dxl_ns.commands import query as commands
-from lang3dxl_ns.commands.query import file_names
+from lang3dxl_ns.commands.query import file_names, parse_texts
 from lang3dxl_ns.common.files import slugs
 
 
@@ -185,3 +185,8 @@ def test_a_view_of_several_texts_is_also_one_picture(run, tmp_path):
 def test_a_text_that_nothing_matches_says_so(run, tmp_path, capsys):
     run("query", "c", "--text", "palm tree", "--out", tmp_path)
     assert "no match; this view comes closest" in capsys.readouterr().out
+
+
+def test_quoted_negatives_of_an_option_are_phrases_like_those_of_a_prompt():
+    (prompt,) = parse_texts(["windows"], ['"doors"', "arcades; niches", ""])
+    assert prompt.negatives == ("doors", "arcades", "niches")

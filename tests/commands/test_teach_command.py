@@ -18,8 +18,16 @@ from lang3dxl_ns.cli import main
 from lang3dxl_ns.commands.query import CocoLabels, Export
 from lang3dxl_ns.commands.teach import Teach, forgotten
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.query.scene_file import keep_words, read_scene, write_scene
-from lang3dxl_ns.query.teach import Example, mask_of, run_lengths
+from lang3dxl_ns.open_scene import find_scene_file
+from lang3dxl_ns.query.scene_file import (
+    Provenance,
+    describe_scene_file,
+    keep_words,
+    read_scene,
+    replace_scene,
+    write_scene,
+)
+from lang3dxl_ns.query.teach import Example, load_words, mask_of, run_lengths
 
 DOME = "61,61,77,77"
 """Box of the dome in all/0003.jpg, a little large."""
@@ -347,3 +355,91 @@ def test_every_connected_part_is_an_annotation():
     assert first["bbox"] == [10, 5, 10, 5] and second["bbox"] == [40, 30, 2, 5]
     assert first["category_id"] == 2 and first["area"] == 50
     assert labels.content["images"] == [{"id": 1, "file_name": "x.jpg", "width": 60, "height": 40}]
+
+
+def test_loaded_words_keep_the_examples_that_only_the_scene_has(place, tmp_path):
+    """As an older copy of its own words lacks the newer ones."""
+    teach(place, "--box", DOME)
+    main(["words", str(place), "--save", str(tmp_path / "words.json")])
+    main(["words", str(place), "--load", str(tmp_path / "words.json")])
+    teach(place, "--at", "69,69")
+    with pytest.raises(SystemExit, match="'gizmo' was taught here by examples, which would be lost"):
+        main(["words", str(place), "--load", str(tmp_path / "words.json")])
+    assert len(words(place)["gizmo"].examples) == 2
+
+
+def retrained(place, path, *gone):
+    """Write a scene of the same photos but some, without words."""
+    scene = read_scene(place, "cpu").with_words(())
+    photos = [photo for photo in scene.file.photos if photo.name not in gone]
+    scene.file = replace(scene.file, photos=photos)
+    write_scene(path, scene)
+
+
+def test_a_word_keeps_the_examples_whose_photos_are_left(place, tmp_path, capsys):
+    teach(place, "--box", DOME)
+    teach(place, "--at", "69,69")
+    photo = next(
+        p.name for p in read_scene(place, "cpu").photos if p.split == "train" and "0003" not in p.name
+    )
+    main(["teach", str(place), "--word", "gizmo", "--photo", photo, "--at", "69,69"])
+    retrained(place, tmp_path / "new.scene", photo)
+    main(["export", str(tmp_path / "new.scene"), "--scene-file", str(place)])
+    assert len(words(place)["gizmo"].examples) == 2
+    said = " ".join(capsys.readouterr().out.split())
+    assert "learned anew from its examples (2); the photos of 1 others are not those of before" in said
+
+
+def test_a_word_that_a_new_scene_brings_leaves_the_earlier_examples_in_a_file(place, tmp_path, capsys):
+    teach(place, "--box", DOME)
+    write_scene(tmp_path / "new.scene", read_scene(place, "cpu"))
+    teach(place, "--at", "69,69")
+    main(["export", str(tmp_path / "new.scene"), "--scene-file", str(place)])
+    assert len(words(place)["gizmo"].examples) == 1
+    kept = place.with_name("wall.gizmo.json")
+    assert str(kept) in capsys.readouterr().out.replace("\n", "")
+    (word,) = load_words(kept)
+    assert len(word.examples) == 2
+
+
+def test_a_scene_written_over_another_keeps_its_credit_and_license(place, tmp_path):
+    told = Provenance("Wall", "photos by A", "CC BY", made_how="by hand")
+    write_scene(place, read_scene(place, "cpu"), told)
+    replace_scene(place, read_scene(place, "cpu"), Provenance("New", license="CC0"))
+    found = describe_scene_file(place)["provenance"]
+    assert (found.title, found.credit, found.license) == ("New", "photos by A", "CC0")
+
+
+def test_teach_takes_the_clip_from_another_place(place, monkeypatch):
+    """Where the scene file's is not on this machine."""
+    asked = []
+    monkeypatch.setattr(
+        "lang3dxl_ns.open_scene.text_encoder", lambda file, device: asked.append(file.clip) or encode_texts
+    )
+    teach(place, "--box", DOME, "--clip", "elsewhere")
+    main(["words", str(place), "--clip", "elsewhere"])
+    assert asked == ["elsewhere", "elsewhere"] and words(place)
+
+
+def test_the_runs_of_a_part_are_those_of_the_whole_mask():
+    generator = np.random.default_rng(0)
+    mask = generator.random((23, 31)) < 0.4
+    mask[0, 0] = mask[-1, -1] = True
+    labels = CocoLabels(["x"])
+    labels.add("a.jpg", [mask])
+    whole = np.zeros_like(mask)
+    for found in labels.content["annotations"]:
+        part = mask_of(found["segmentation"]["counts"], (23, 31))
+        assert found["segmentation"]["counts"] == run_lengths(part) and part.sum() == found["area"]
+        assert not (part & whole).any()
+        whole |= part
+    assert not (whole & ~mask).any()
+    assert (mask & ~whole).sum() < 0.5 * mask.sum()
+
+
+def test_hidden_files_beside_a_scene_are_no_scenes(place):
+    """macOS leaves one beside each file on disks of other systems."""
+    place.with_name("._wall.scene").write_bytes(b"\0\5\x16\7")
+    assert find_scene_file(place.parent) == place
+    with pytest.raises(SystemExit, match=r"wall\.scene is scored with --ground-truth"):
+        main(["evaluate", "run", str(place.parent), "--out", str(place.parent / "report")])

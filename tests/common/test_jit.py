@@ -57,6 +57,19 @@ def test_a_kernel_is_compiled_once_with_a_word_and_then_read_from_the_disk(run):
     assert first.endswith("[0. 2. 4.]\n") and second.endswith("[0. 2. 4.]\n")
 
 
+def test_a_kernel_is_compiled_anew_when_a_source_that_kernels_share_changes(run, tmp_path):
+    """Their constants and small functions are compiled into it."""
+    run()
+    changed = "from lang3dxl_ns.common import jit\n\njit._shared_sources = lambda: 'changed'\n"
+    (tmp_path / "kernel_module.py").rename(tmp_path / "same.py")
+    (tmp_path / "kernel_module.py").write_text(f"{changed}from same import doubled\n")
+    again = "from same import doubled\n"
+    assert run().count("Compiling") == 1  # this file's first kernel
+    assert run().count("Compiling") == 0
+    (tmp_path / "kernel_module.py").write_text(again)
+    assert run().count("Compiling") == 1
+
+
 def test_without_a_folder_that_can_be_written_a_kernel_is_compiled_anew(run, tmp_path):
     (tmp_path / "__pycache__").write_text("a file where the folder would be")
     for _ in range(2):

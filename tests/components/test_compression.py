@@ -12,11 +12,13 @@ from lang3dxl_ns.components import compression
 from lang3dxl_ns.components.compression import (
     CompressedField,
     CompressionConfig,
+    JointField,
     centered_cosine,
     draw_sample,
     fit,
 )
 from lang3dxl_ns.components.feature_decoder import Gathered
+from lang3dxl_ns.components.learn_codes import TargetView, learn_codes
 from lang3dxl_ns.components.principal_basis import PrincipalBasis
 from lang3dxl_ns.components.semantic_field import SemanticField, SemanticFieldConfig
 
@@ -229,3 +231,18 @@ def test_a_number_of_numbers_that_was_asked_for_is_kept(monkeypatch):
     config = SemanticFieldConfig("short", code_dim=2)
     decoder = CompressedField(config, CHANNELS, CompressionConfig(20, 128))
     assert decoder.learn_gaussians(everything(features)).shape[1] == 2
+
+
+def test_codes_are_learned_in_full_precision_in_the_middle_of_a_mixed_precision_step():
+    """A step's autocast keeps 16-bit copies of the first weights, which an optimizer would not change."""
+    features, _ = clusters([48] * 4)
+    maps = features.view(12, 16, CHANNELS)
+    view = TargetView(lambda values: values.view(12, 16, -1), (12, 16), maps)
+    found = []
+    for enabled in (False, True):
+        torch.manual_seed(0)
+        decoder = JointField(SemanticFieldConfig("short"), CHANNELS, FEW)
+        with torch.autocast("cpu", torch.bfloat16, enabled=enabled):
+            codes = learn_codes(decoder, [view], 1, torch.zeros(len(features), 3), lambda: [maps])
+        found.append((codes, decoder.decode_clip(codes)))
+    torch.testing.assert_close(found[0], found[1])

@@ -1,9 +1,9 @@
-"""Feature metrics against numbers worked out by hand."""
+"""Feature metrics against numbers worked out by hand, and the files of a photo's pictures."""
 
 import pytest
 import torch
 
-from lang3dxl_ns.evaluation.photo_metrics import feature_metrics
+from lang3dxl_ns.evaluation.photo_metrics import EvaluatedPhoto, feature_metrics
 
 
 def test_a_constant_error_has_the_l1_and_psnr_of_that_error():
@@ -28,3 +28,10 @@ def test_cells_without_weight_do_not_count():
     weight[0] = 0
     assert feature_metrics("clip", predicted, target, target[0, 0], weight)["clip_l1"] == 0
     assert feature_metrics("clip", predicted, target, target[0, 0], torch.zeros(4, 4)) == {}
+
+
+def test_every_photo_has_a_picture_of_its_own_whatever_its_name(tmp_path):
+    names = ["a/b.jpg", "a_b.jpg", "ä" * 200 + ".jpg", "a/" + "ä" * 200 + ".jpg"]
+    for name in names:
+        EvaluatedPhoto(name, {}, {"img": torch.zeros(2, 4, 3)}, {}).write_pictures(tmp_path)
+    assert len(list(tmp_path.glob("*.img.jpg"))) == len(names)

@@ -45,6 +45,11 @@ def test_a_named_colmap_model_that_is_not_there(start, folder):
         start(folder, pipeline__datamanager__dataparser__colmap_path=Path("elsewhere"))
 
 
+def test_a_misspelled_colmap_model_is_not_replaced_by_another(start, folder):
+    with pytest.raises(UserError, match="no COLMAP model"):
+        start(folder, pipeline__datamanager__dataparser__colmap_path=Path("sparse/geo"))
+
+
 def test_neither_colmap_model_nor_photos(start, folder):
     shutil.rmtree(folder / "sparse")
     shutil.rmtree(folder / "images")

@@ -4,9 +4,11 @@ import os
 import shutil
 import signal
 from copy import deepcopy
+from pathlib import Path
 
 import pytest
 import torch
+from conftest import make_trainer
 from scenes import write_scene
 
 from lang3dxl_ns.common.errors import UserError
@@ -174,6 +176,35 @@ def test_a_relative_cache_is_found_from_any_folder(train, tmp_path, monkeypatch)
         data, 1, semantics=False, pipeline__datamanager__cache_dir=tmp_path.relative_to(tmp_path) / "c"
     )
     assert read_config(run.base_dir / "config.yml").pipeline.datamanager.cache_dir == tmp_path / "c"
+
+
+@pytest.fixture
+def settled(tmp_path, monkeypatch):
+    """What config.yml says of a run with these encoders that begins beside its photos, in `tmp_path`."""
+    monkeypatch.chdir(tmp_path)
+    write_scene(tmp_path / "scene", photos=2, points=20)
+
+    def begin(clip, dense):
+        here = {f"{PARSER}data": Path("scene")}
+        trainer = make_trainer(Path("scene"), clip, dense, Path("out"), 1, **here)
+        return read_config(trainer.base_dir / "config.yml").pipeline.datamanager
+
+    return begin
+
+
+def test_relative_encoders_and_photos_are_found_from_any_folder(settled, tiny_clip, tiny_dense, tmp_path):
+    for name, folder in (("clip", tiny_clip), ("dense", tiny_dense)):
+        (tmp_path / name).symlink_to(folder)
+    found = settled("clip", "dense")
+    assert (found.clip, found.dense) == (str(tmp_path / "clip"), str(tmp_path / "dense"))
+    assert found.data == found.dataparser.data == tmp_path / "scene"
+
+
+def test_a_folder_named_like_the_builtin_encoders_or_none_is_not_meant(settled, tmp_path):
+    for name in ("builtin", "none"):
+        (tmp_path / name).mkdir()
+    found = settled("builtin", "none")
+    assert (found.clip, found.dense) == ("builtin", "none")
 
 
 def test_a_checkpoint_has_no_rendering_in_it(train, tmp_path):

@@ -1,6 +1,7 @@
 """`--data` may be photos alone, a video, or a folder with a transforms.json."""
 
 import json
+import os
 import shutil
 import subprocess
 from pathlib import Path
@@ -137,6 +138,27 @@ def test_frames_of_another_video_are_not_taken_for_this_ones(walk, tmp_path):
         extract_frames(video)
 
 
+@needs_ffmpeg
+def test_what_is_typed_while_frames_are_read_is_no_command_to_ffmpeg(walk, tmp_path, monkeypatch):
+    """A script may feed its other commands by the same standard input."""
+    for program in ("ffmpeg", "ffprobe"):  # which reads its input first: ffmpeg looks at it now and then
+        greedy = tmp_path / program
+        greedy.write_text(f'#!/bin/sh\ncat > /dev/null\nexec {shutil.which(program)} "$@"\n')
+        greedy.chmod(0o755)
+    video, typed, own = make_video(walk, tmp_path / "walk.mp4"), tmp_path / "typed", os.dup(0)
+    typed.write_text("q" * 10)
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
+    with typed.open() as file:
+        os.dup2(file.fileno(), 0)
+        try:
+            frames = list((extract_frames(video) / "images").iterdir())
+            left = os.read(0, 20)
+        finally:
+            os.dup2(own, 0)
+            os.close(own)
+    assert len(frames) == 8 and left == b"q" * 10
+
+
 def test_an_empty_images_folder_does_not_hide_the_photos(walk, tmp_path):
     data = shutil.copytree(walk, tmp_path / "data")
     (data / "images").mkdir()
@@ -160,3 +182,13 @@ def test_a_video_without_ffmpeg_is_an_error_that_names_it(tmp_path, monkeypatch)
 
 def test_of_every_stretch_the_sharpest_frame_is_taken():
     assert _sharpest(np.array([1, 5, 2, 9, 0, 3, 4.0]), 3).tolist() == [1, 3, 6]
+
+
+@pytest.mark.parametrize("other", ["cache/reconstruction/sparse/0/images.bin", "scene/transforms.json"])
+def test_a_misspelled_model_is_not_replaced_by_the_caches_or_by_transforms(tmp_path, other):
+    data = write_scene(tmp_path / "scene", photos=3, points=30)
+    (tmp_path / other).parent.mkdir(parents=True, exist_ok=True)
+    (tmp_path / other).write_text("{}")
+    parser = PhotoCollectionDataParserConfig(data=data, colmap_path=Path("sparse/geo"))
+    chosen = parser_for(parser, tmp_path / "cache", True)
+    assert chosen is parser and chosen.colmap_path == Path("sparse/geo")

@@ -14,6 +14,7 @@ from lang3dxl_ns.components.initialization import sphere_around
 from lang3dxl_ns.plugin.datamanager import Lang3DXLDataManager
 from lang3dxl_ns.plugin.dataparser import PhotoCollectionDataParserConfig
 from lang3dxl_ns.plugin.photo_dataset import PhotoDataset
+from lang3dxl_ns.preparation import photo_cache
 from lang3dxl_ns.preparation.photo_cache import PhotoCache
 from lang3dxl_ns.preparation.store import FeatureStore
 from lang3dxl_ns.preparation.working_photos import WorkingPhotos
@@ -60,6 +61,19 @@ def test_the_cache_raises_the_reading_error():
     cache = PhotoCache(broken, max_bytes=1)
     with pytest.raises(UserError, match="photo 3 is torn"):
         cache.get(3, [])
+
+
+def test_targets_that_vanish_are_waited_for_like_photos(tmp_path, monkeypatch):
+    store, waits = FeatureStore(tmp_path), []
+
+    def sleep(seconds):
+        waits.append(seconds)
+        store.write("clip", "a.jpg", photo(7), {})
+
+    monkeypatch.setattr(photo_cache.time, "sleep", sleep)
+    cache = PhotoCache(lambda _: store.read("clip", "a.jpg"), max_bytes=0)
+    assert int(cache.get(0, [])["image"][0, 0]) == 7
+    assert len(waits) == 1
 
 
 def test_the_first_that_fit_are_kept_and_the_rest_is_read_ahead_once_per_round():

@@ -155,6 +155,13 @@ def test_a_listed_photo_that_is_not_there_is_named(scene, tmp_path):
         split(scene, "photo_099\n", tmp_path)
 
 
+@pytest.mark.parametrize("name", ["seq/b.jpg", "seq/b", "b.jpg", "b"])
+def test_a_photo_may_be_listed_without_its_folder_and_its_suffix(tmp_path, name):
+    (tmp_path / "held_out.txt").write_text(name)
+    parser = PhotoCollectionDataParserConfig(held_out=tmp_path / "held_out.txt").setup()
+    assert parser._held_out(["seq/a.jpg", "seq/b.jpg"]) == [1]
+
+
 def test_folders_of_pt_ovs_are_read_as_published(scene, tmp_path):
     """brandenburg_gate/dense/{images,sparse} and label/brandenburg_gate/<photo>.json beside it."""
     data = tmp_path / "brandenburg_gate"
@@ -199,3 +206,10 @@ def test_a_run_of_other_photos_keeps_its_cameras_and_is_not_evaluated(train, tmp
     for path in away.iterdir():
         path.rename(data / "images" / path.name)
     assert "psnr" in opened().evaluation.scored()
+
+
+def test_a_photo_listed_by_its_whole_name_is_that_one(tmp_path):
+    """Also if another folder holds one of the same file name."""
+    (tmp_path / "held_out.txt").write_text("a.jpg\nday/b.jpg")
+    parser = PhotoCollectionDataParserConfig(held_out=tmp_path / "held_out.txt").setup()
+    assert parser._held_out(["a.jpg", "day/a.jpg", "day/b.jpg", "day/b.png"]) == [0, 2]

@@ -1,6 +1,7 @@
 """Exact resume: a resumed run equals the uninterrupted one to the last bit."""
 
 import shutil
+import signal
 from dataclasses import replace
 
 import pytest
@@ -8,7 +9,9 @@ import torch
 from conftest import make_trainer
 
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.open_scene import load_scene
 from lang3dxl_ns.plugin.pipeline import Lang3DXLPipeline
+from lang3dxl_ns.plugin.trainer import Lang3DXLTrainer
 from lang3dxl_ns.query.run_file import SCENE_FILE, SceneFile
 
 EVERYTHING = {
@@ -157,3 +160,42 @@ def test_codes_that_were_trained_do_not_start_again_in_a_longer_run(train, scene
     first = train(scene, iterations=6, **settings)
     monkeypatch.setattr(Lang3DXLPipeline, "learn_words", lambda self: pytest.fail("started again"))
     train(scene, iterations=20, load_dir=first.checkpoint_dir, **settings)
+
+
+# ── a finished run that learned words after its last step, and is prolonged ─────────────────────────────
+
+
+@pytest.fixture(scope="module")
+def finished(scene, tiny_clip, tiny_dense, tmp_path_factory):
+    """A finished run of three steps whose checkpoint holds codes."""
+    trainer = make_trainer(scene, tiny_clip, tiny_dense, tmp_path_factory.mktemp("finished"), 3)
+    trainer.setup()
+    trainer.train()
+    assert "_model.gauss_params.codes" in last_checkpoint(trainer)["pipeline"]
+    return trainer
+
+
+def test_a_finished_run_can_be_prolonged_while_gaussians_multiply(train, scene, finished):
+    longer = train(scene, iterations=8, load_dir=finished.checkpoint_dir)
+    model = longer.pipeline.model
+    assert longer.words_are_learned
+    assert len(model.gauss_params["codes"]) == model.num_points > finished.pipeline.model.num_points
+
+
+def test_a_prolonged_run_that_is_stopped_keeps_no_codes_of_the_shorter_one(
+    train, scene, finished, tmp_path, monkeypatch
+):
+    step = Lang3DXLTrainer.train_iteration
+
+    def stopped(self, number):
+        if number == 4:
+            signal.raise_signal(signal.SIGINT)
+        return step(self, number)
+
+    monkeypatch.setattr(Lang3DXLTrainer, "train_iteration", stopped)
+    with pytest.raises(SystemExit):
+        train(scene, iterations=8, load_dir=finished.checkpoint_dir, pipeline__model__densify_until=0.0)
+    (path,) = tmp_path.rglob("*.ckpt")
+    assert "_model.gauss_params.codes" not in torch.load(path, weights_only=True)["pipeline"]
+    with pytest.raises(UserError, match="learned when training ends; resume it"):
+        load_scene(path.parents[1])

@@ -12,6 +12,7 @@ from nerfstudio.utils.eval_utils import eval_setup
 from PIL import Image
 
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.plugin.trainer import Lang3DXLTrainer
 
 
 @pytest.fixture
@@ -82,6 +83,18 @@ def test_densification_carries_the_codes(train, scene):
     model = trainer.pipeline.model
     assert model.num_points > 400
     assert {len(p) for p in model.gauss_params.values()} == {model.num_points}
+
+
+def test_what_is_kept_of_a_step_keeps_nothing_that_it_computed(train, scene, monkeypatch):
+    """nerfstudio holds a step's losses and metrics through the next one; a graph would hold its images."""
+    results, step = [], Lang3DXLTrainer.train_iteration
+    monkeypatch.setattr(
+        Lang3DXLTrainer, "train_iteration", lambda *args: results.append(step(*args)) or results[-1]
+    )
+    trainer = train(scene, iterations=1)
+    loss, losses, metrics = results[0]
+    kept = [loss, *losses.values(), *metrics.values(), *trainer.pipeline.last_losses.values()]
+    assert len(kept) > 4 and all(value.grad_fn is None for value in kept)
 
 
 def test_warm_up_trains_no_code(train, scene):

@@ -139,10 +139,13 @@ def test_masks_of_a_distorting_lens_lie_on_the_file(config, tmp_path, seen):
     assert masked.read_mask().shape == (1500, 2000)
 
 
-def test_a_second_run_makes_nothing_and_loads_no_network(photos, config, tmp_path, seen, monkeypatch):
+def test_a_second_run_makes_nothing_and_reads_neither_network_nor_photos(
+    photos, config, tmp_path, seen, monkeypatch
+):
     first = run(photos, config, tmp_path)
     assert len(seen) == 3
     monkeypatch.setattr(foreground, "load_text_segmenter", None)
+    monkeypatch.setattr(Photo, "content_hash", lambda _: pytest.fail("a photo was read"))
     assert run(photos, config, tmp_path) == first
     assert len(seen) == 3
 
@@ -187,10 +190,11 @@ def test_a_photo_in_which_nothing_is_found_counts_whole_and_is_named(photos, con
     assert "found nothing in 3 photos, which are used whole: north/a.png" in lines[-1]
 
 
-def test_an_unreadable_photo_affects_no_other(photos, config, tmp_path, seen):
+def test_an_unreadable_photo_has_no_mask_and_affects_no_other(photos, config, tmp_path, seen):
     photos[0].path.write_bytes(b"not a photo")
     photos[1].path.unlink()
     masked = run(photos, config, tmp_path)
+    assert [photo.mask_path for photo in masked[:2]] == [None, None]
     assert masked[2].mask_path.is_file()
     assert len(seen) == 1
 

@@ -156,6 +156,14 @@ def test_the_inner_mean_leaves_points_at_the_edges_out():
     assert pixel_size(only_edges, distance="mean-inner") == pixel_size(photo, distance="mean")
 
 
+def test_points_whose_pixels_are_not_recorded_count_where_the_camera_sees_them():
+    """Scenes without a COLMAP model have points alone."""
+    points, pixels = [(0, 0, 10), (0, 13.5, 30), (9, 0, 20)], [(500, 500), (500, 950), (950, 500)]
+    recorded, bare = make_photo(points, pixels), make_photo(points, np.zeros((0, 2)))
+    assert pixel_size(bare, "mean-inner") == pixel_size(recorded, "mean-inner")
+    assert pixel_size(bare, "mean-inner") != pixel_size(bare, "mean")
+
+
 @pytest.mark.parametrize("points", [[], [(0, 0, 0)]])
 @pytest.mark.parametrize("distance", ["median", "mean", "mean-inner"])
 def test_a_photo_without_usable_points_has_no_pixel_size(points, distance):

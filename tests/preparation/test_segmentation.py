@@ -138,6 +138,12 @@ def test_models_of_another_kind_are_refused_with_the_option_to_change(models):
         find_text_segmenter(models["grounding"], models["clipseg"])
 
 
+def test_no_segmentation_network_is_built_in(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(UserError, match=r"builtin.*datamanager\.sam"):
+        find_sam("builtin")
+
+
 def test_offline_the_error_says_how_to_get_the_model(models):
     with pytest.raises(
         UserError, match=r"hf download IDEA-Research/grounding-dino-tiny .*foreground-model DIR"

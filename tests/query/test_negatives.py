@@ -37,3 +37,11 @@ def test_a_whole_competes_with_its_parts(whole):
 
 def test_a_prompt_that_names_everything_competes_with_everything():
     assert competitors(["window", "door"], ["window door"]) == [0, 1]
+
+
+@pytest.mark.parametrize(
+    ("hyphened", "spaced"),
+    [("bell-tower", "bell tower"), ("rose-window", "rose window"), ("flying-buttress", "flying buttress")],
+)
+def test_a_hyphen_is_a_space(hyphened, spaced):
+    assert against(hyphened) == against(spaced) and synonyms_of(hyphened) == synonyms_of(spaced)

@@ -3,6 +3,7 @@
 import gzip
 import pickle
 import struct
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -378,3 +379,18 @@ def test_what_a_ply_lists_twice_is_refused(line, tmp_path):
     (tmp_path / "a.ply").write_bytes(header + line + b"end_header\n" + body)
     with pytest.raises(UserError, match=r"twice|more than once"):
         read_splats(tmp_path / "a.ply")
+
+
+def test_a_checkpoint_of_several_gpus_is_read_whole(tmp_path):
+    splats = some_splats()
+    for rank, part in enumerate((splats.select(torch.arange(100)), splats.select(torch.arange(100, 300)))):
+        torch.save(gsplat_state(part), tmp_path / f"ckpt_6999_rank{rank}.pt")
+    for file in ("ckpt_6999_rank0.pt", "ckpt_6999_rank1.pt"):
+        assert_alike(read_splats(tmp_path / file), splats)
+
+
+def test_an_spz_of_map_coordinates_is_refused_rather_than_cut(tmp_path):
+    splats = some_splats(10)
+    far = replace(splats, means=splats.means + torch.tensor([0.0, 9e6, 0.0]))
+    with pytest.raises(UserError, match="these reach 9,000,00"):
+        write_splats(tmp_path / "far.spz", far)

@@ -10,7 +10,8 @@ import torch
 from painted_scene import Painted, painted_codes, painted_gaussians, painted_scene, painted_splats
 
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.query.learn_word import _logistic, _Photo
+from lang3dxl_ns.query import learn_word
+from lang3dxl_ns.query.learn_word import Weights, _logistic, _Photo
 from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.query.scene_file import read_scene, write_scene
 from lang3dxl_ns.query.teach import Example, load_words, save_words
@@ -280,3 +281,17 @@ def test_gaussians_that_no_photo_shows_do_not_change_what_a_word_is(scene):
     )
     with pytest.raises(UserError, match="no photo gave a Gaussian"):
         painted_scene(codes=torch.full_like(codes, torch.nan)).teach("thing", mark)
+
+
+def test_clicks_are_not_lost_among_the_gaussians_of_an_outline(monkeypatch):
+    """Of which only some are fitted."""
+    monkeypatch.setattr(learn_word, "_ROWS", 100)
+    rows, everything = torch.arange(1000), torch.ones(1000)
+    outline, click = (rows < 900).float(), ((rows >= 943) & (rows < 957)).float()
+    examples = [Example("a", points=((1, 1),)), Example("b", points=((1, 1),))]
+    weights = [Weights(word, torch.zeros(1000), everything) for word in (outline, click)]
+    sampled, photos = learn_word._sampled(examples, weights)
+    assert len(sampled) <= 2 * 100
+    clicked = sampled[photos[1].word > 0]
+    assert set(clicked.tolist()) == set(rows[click > 0].tolist())
+    assert all(float(part.sum()) == pytest.approx(1) for one in photos for part in (one.word, one.rest))

@@ -9,6 +9,7 @@ from lang3dxl_ns.query.text import (
     TextConfig,
     TextEncoder,
     caution,
+    listed_phrases,
     parse_prompts,
 )
 from lang3dxl_ns.query.vocabulary import (
@@ -188,3 +189,30 @@ def test_names_are_not_called_nothing(typed):
 @pytest.mark.parametrize(("typed", "said"), [("red roof", True), ("red", False), ("colored glass", False)])
 def test_colors_are_said_to_be_ignored(typed, said):
     assert bool(caution(typed)) is said and searched(typed) == typed
+
+
+@pytest.mark.parametrize(
+    ("typed", "phrases"),
+    [
+        ('"doors"', ["doors"]),
+        ("doors; big  gates, arcades", ["doors", "big gates", "arcades"]),
+        ("“a; b”, c", ["a; b", "c"]),
+        ("", []),
+        ('" "', []),
+    ],
+)
+def test_negatives_of_an_option_are_read_as_those_of_a_prompt(typed, phrases):
+    assert listed_phrases([typed]) == phrases
+
+
+@pytest.mark.parametrize("typed", ["Big Ben", "The Last Supper", "First Baptist Church"])
+def test_a_name_is_searched_for_whole(typed):
+    assert searched(typed) == typed and caution(typed) is None
+
+
+def test_capital_letters_need_no_clip():
+    def no_clip(texts):
+        raise AssertionError(texts)
+
+    encoder = TextEncoder(no_clip, known={"rose window": torch.eye(3)[0]})
+    assert torch.equal(encoder.vectors(["Rose Window"])[0], torch.eye(3)[0])

@@ -239,7 +239,7 @@ def cells(mask: np.ndarray) -> np.ndarray:
 # ── the same answers as Python's ────────────────────────────────────────────────────────────────────────
 
 
-@pytest.mark.parametrize("text", ["dome", "windows", "wall", "belfry", "flying buttress"])
+@pytest.mark.parametrize("text", ["dome", "windows", "wall", "belfry", "cupolas", "flying buttress"])
 def test_a_word_is_answered_as_by_python(answering, text):
     scene, think = answering
     question = scene.ask(text)

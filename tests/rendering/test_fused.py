@@ -4,10 +4,21 @@ import numba
 import numpy as np
 import pytest
 import torch
-from splat_clouds import gradients, make_cloud, maps
+from splat_clouds import gaussians, gradients, make_cloud, maps
 
-from lang3dxl_ns.rendering import fused_compositing, rasterize
+from lang3dxl_ns.rendering import (
+    Gaussians,
+    Raster,
+    fused_compositing,
+    fused_projection,
+    projection,
+    rasterize,
+)
+from lang3dxl_ns.rendering.fused_compositing import FusedCompositing
+from lang3dxl_ns.rendering.rasterize import EPS2D
 from lang3dxl_ns.rendering.simd import LANES, exp2, load, store
+from lang3dxl_ns.rendering.torch_rasterizer import Compositing
+from lang3dxl_ns.scene.camera import Camera
 
 
 @numba.njit
@@ -73,6 +84,46 @@ def test_any_number_of_channels_equals_the_torch_kernels(channels):
         torch.testing.assert_close(getattr(found, name), value, atol=1e-10, rtol=0)
     expected_gradients = gradients(expected, theirs)
     for name, value in gradients(found, ours).items():
+        torch.testing.assert_close(value, expected_gradients[name], atol=1e-9, rtol=1e-9)
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+@pytest.mark.parametrize("size", [1e3, 1e5])
+def test_huge_ellipses_have_exact_gradients_in_float32(size, antialiased):
+    """Standard deviations of 1e4 to 1e7 pixels."""
+    cloud = make_cloud(60, 32, 24)
+    cloud.tensors["scales"] = size * torch.tensor([1.0, 2.0, 0.5]).double().expand(60, 3)
+    exact, single = cloud.leaves(), cloud.leaves(torch.float32)
+    settings = {"backend": "numba", "antialiased": antialiased}
+    expected = gradients(cloud.render(rasterize, exact, **settings), exact)
+    found = gradients(cloud.render(rasterize, single, **settings), single)
+    for name in ("means", "quats", "scales", "opacities"):
+        assert (found[name].double() - expected[name]).norm() <= 1e-5 * expected[name].norm(), name
+
+
+def test_a_flat_ellipse_without_blur_has_finite_gradients():
+    camera = Camera(torch.eye(4), torch.tensor([[20.0, 0, 8.5], [0, 20, 8.5], [0, 0, 1]]), 16, 16)
+    parts = torch.tensor([[0.0, 0, 1]]), torch.tensor([[1.0, 0, 0, 0]]), torch.tensor([[0.1, 0, 0]])
+    leaves = [part.requires_grad_() for part in (*parts, torch.tensor([0.8]))]
+    raster = rasterize(Gaussians(*leaves), camera, torch.ones(1, 3), eps2d=0.0, backend="numba")
+    for gradient in torch.autograd.grad(raster.image.sum(), leaves):
+        assert bool(gradient.isfinite().all())
+
+
+@pytest.mark.parametrize("to_screen", [projection.project, fused_projection.project])
+@pytest.mark.parametrize("compositing", [Compositing, FusedCompositing])
+def test_either_projection_goes_with_either_compositing(to_screen, compositing):
+    cloud = make_cloud(200, 40, 30)
+    found, expected = cloud.leaves(), cloud.leaves()
+    ellipses = to_screen(gaussians(found), cloud.camera(found), near=0.01, eps2d=EPS2D, antialiased=True)
+    image, alpha = compositing.apply(
+        ellipses.means2d, ellipses.conics, ellipses.opacities, found["channels"], ellipses.variances,
+        ellipses.depths, cloud.width, cloud.height,
+    )  # fmt: skip
+    image = image + (1 - alpha) * found["background"]
+    settings = {"backend": "torch", "antialiased": True, "render_depth": False}
+    expected_gradients = gradients(cloud.render(rasterize, expected, **settings), expected)
+    for name, value in gradients(Raster(image, alpha, None), found).items():
         torch.testing.assert_close(value, expected_gradients[name], atol=1e-9, rtol=1e-9)
 
 

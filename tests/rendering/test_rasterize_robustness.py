@@ -142,6 +142,15 @@ def test_a_long_needle_is_as_exact_in_float32_far_from_its_center():
     assert float((image - expected).abs().max()) < 2e-4
 
 
+def test_needles_have_exact_gradients_in_float32():
+    cloud = make_cloud(100, 112, 84)
+    cloud.tensors["scales"] = torch.tensor([3.0, 1e-4, 1e-4]).double().expand(100, 3)
+    exact, single = cloud.leaves(), cloud.leaves(torch.float32)
+    expected = gradients(cloud.render(rasterize, exact, eps2d=3e-3), exact)
+    for name, value in gradients(cloud.render(rasterize, single, eps2d=3e-3), single).items():
+        assert relative_error(value, expected[name]) < 1e-3, name
+
+
 @pytest.mark.parametrize("backend", ["torch"], indirect=True)
 def test_the_size_of_a_chunk_changes_nothing(monkeypatch):
     cloud = make_cloud(500, 60, 40, size=0.15)

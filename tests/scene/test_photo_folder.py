@@ -29,8 +29,10 @@ def put(path, size=(8, 6), body=None, focal=None):
         (["day/a.jpg", "night/a.jpg"], ".", ["day/a.jpg", "night/a.jpg"]),
         (["a.jpg", "masks/a.png", "outputs/x/r.png", ".trash/b.jpg"], ".", ["a.jpg"]),
         (["sparse/0/images.bin"], ".", []),
+        (["a.jpg", "targets/photos/a.jpg.0123456789abcdef.jpg"], ".", ["a.jpg"]),
+        (["a.jpg", "targets/reconstruction/numbered/0.jpg"], ".", ["a.jpg"]),
     ],
-    ids=["flat", "images", "sub-folders", "no masks", "none"],
+    ids=["flat", "images", "sub-folders", "no masks", "none", "no cache", "no reconstruction's copies"],
 )
 def test_photos_are_found(tmp_path, files, folder, names):
     for file in files:

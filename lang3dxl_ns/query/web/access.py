@@ -64,8 +64,9 @@ class Access:
                 return _refused("Open the address with its token, which the terminal shows.")
         except ValueError as error:
             return HTTPStatus.BAD_REQUEST, {"Content-Type": "text/plain"}, f"{error}\n".encode()
-        # Remove the token from the address, which the page could pass on.
-        cookie = f"viewer-{self.port}={self.token}; Path=/; HttpOnly; SameSite=Strict"
+        # Remove the token from the address, which the page could pass on. Strict would not send the cookie to
+        # that address if the link was followed from another site, such as a chat.
+        cookie = f"viewer-{self.port}={self.token}; Path=/; HttpOnly; SameSite=Lax"
         return HTTPStatus.SEE_OTHER, {"Set-Cookie": cookie, "Location": "/"}, b""
 
     def _same_site(self, origin: str, host: str) -> bool:

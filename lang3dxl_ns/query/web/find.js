@@ -125,7 +125,7 @@ function groupsOf(rows, centers, weightOf, size) {
     cells.delete(first.place.join());
     while (waiting.length) {
       const { place, rows, weight } = waiting.pop();
-      group.rows.push(...rows);
+      for (const i of rows) group.rows.push(i); // spread out, they may be more arguments than a call takes
       group.weight += weight;
       for (let k = 0; k < 27; k++) {
         const key = [place[0] + (k % 3) - 1, place[1] + (Math.floor(k / 3) % 3) - 1, place[2] + Math.floor(k / 9) - 1].join();

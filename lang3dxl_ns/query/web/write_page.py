@@ -161,7 +161,7 @@ class Page:
         special, learned = {}, {}
         for i, word in enumerate(words):
             known = taught.get(known_word(word))
-            if i < len(naming) or known is not None:
+            if i < len(naming) or known is not None or self.scene.text.synonyms(word):
                 near, against = self._meant(meaning, word)
             else:
                 near, against = numbers[0][:1], competitors(negatives, [word])
