@@ -103,8 +103,7 @@ class Words:
             for word in load_words(self.load):
                 name, own = known_word(word.name), scene.words
                 scene = scene.carrying(word)
-                kept = [example.to_json() for example in scene.words[name].examples]
-                if name in own and any(example.to_json() not in kept for example in own[name].examples):
+                if name in own and scene.words[name].lacks_examples_of(own[name]):
                     hint = "--forget it too, or rename it in the file"
                     raise UserError(f"{word.name!r} was taught here by examples, which would be lost: {hint}")
         words = list(scene.words.values())

@@ -153,16 +153,17 @@ def replace_scene(path: Path, scene: Scene, told: Provenance, *earlier: Path) ->
     scene and the number of bytes. A command that teaches there at this moment comes first, or waits."""
     with locked(path.parent):
         for file in (path, *earlier):
-            scene = _with_words_of(scene, file)
+            scene = _with_words_of(scene, file, path)
         with suppress(UserError):  # no such file, or a damaged one
             old = describe_scene_file(path)["provenance"]
             told = replace(told, credit=told.credit or old.credit, license=told.license or old.license)
         return scene, write_scene(path, scene, told)
 
 
-def _with_words_of(scene: Scene, earlier: Path) -> Scene:
+def _with_words_of(scene: Scene, earlier: Path, replaced: Path) -> Scene:
     """Return the scene with a file's taught words, where it doesn't know them. Log which are kept and how,
-    and which are lost. A missing file has no words."""
+    and which are lost. A missing file has no words. Words of the `replaced` file that the scene knows from
+    other examples are saved beside it."""
     if not earlier.is_file():
         return scene
     try:
@@ -173,8 +174,11 @@ def _with_words_of(scene: Scene, earlier: Path) -> Scene:
     for word in words:
         name, new = known_word(word.name), scene.words.get(known_word(word.name))
         if new is not None:
-            if len(new.examples) < len(word.examples):
-                backup = earlier.with_name(f"{earlier.stem}.{slugs([name])[0]}.json")
+            if earlier == replaced and new.lacks_examples_of(word):
+                names = (
+                    f"{earlier.stem}.{slugs([name])[0]}{number}.json" for number in ("", *range(2, 1000))
+                )
+                backup = next(path for each in names if not (path := earlier.with_name(each)).exists())
                 save_words(backup, [word])
                 say(f"The taught word {word.name!r} is replaced; with its examples it is kept in {backup}")
             continue

@@ -165,6 +165,11 @@ class TaughtWord:
         """Compute the margins of unit features, given the margins of the word's text for them."""
         return features @ self.vector.to(features) + self.bias + self.text * text
 
+    def lacks_examples_of(self, other: TaughtWord) -> bool:
+        """Return whether another word has examples that this one doesn't have."""
+        own = [example.to_json() for example in self.examples]
+        return any(example.to_json() not in own for example in other.examples)
+
     def to_json(self) -> dict[str, Any]:
         """Convert the word to JSON."""
         kept = {name: getattr(self, name) for name in ("name", "bias", "text", "doubt", "clip", "scene")}

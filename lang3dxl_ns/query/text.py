@@ -162,7 +162,8 @@ class TextEncoder:
     ) -> None:
         self.config = config or TextConfig()
         self._encode = encode
-        self._vectors = dict(known or {})
+        self._known = known or {}
+        self._vectors = dict(self._known)
         self._lock = threading.Lock()
 
     def synonyms(self, text: str) -> list[str]:
@@ -209,9 +210,9 @@ class TextEncoder:
     def vectors(self, texts: Sequence[str]) -> Float[Tensor, "n c"]:
         """Encode texts as unit vectors."""
         texts = texts_of(texts, "what is encoded")
+        # So a capital letter needs no CLIP.
+        texts = [text.lower() if text.lower() in self._known else text for text in texts]
         with self._lock:  # two threads can't use a tokenizer at once
-            small = {text: self._vectors[text.lower()] for text in texts if text.lower() in self._vectors}
-            self._vectors = small | self._vectors  # so that a capital letter needs no CLIP
             new = [text for text in dict.fromkeys(texts) if text not in self._vectors]
             if new:
                 self._vectors |= zip(new, F.normalize(self._encode(new), dim=-1), strict=True)
