@@ -24,6 +24,7 @@ from lang3dxl_ns.common.checks import disk_trouble
 from lang3dxl_ns.common.console import accept_any_console, silence_libraries
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import expanded
+from lang3dxl_ns.common.memory import ran_out_of_memory
 from lang3dxl_ns.common.settings_help import asked_for_all
 
 LAB = Path(__file__).parents[1] / "lab"
@@ -90,6 +91,10 @@ def main(arguments: list[str] | None = None) -> None:
         if error.filename is None:
             _leave_output()
         sys.exit(f"Error: {trouble}")
+    except (RuntimeError, MemoryError) as error:
+        if not ran_out_of_memory(error):
+            raise
+        sys.exit("Error: out of memory: give a smaller --size, or run on the CPU with CUDA_VISIBLE_DEVICES=")
     except KeyboardInterrupt:
         print("\nStopped; finished work is kept.", file=sys.stderr)
         sys.exit(130)

@@ -41,10 +41,14 @@ def with_less_memory(work: Callable[[int], T], amount: int) -> T:
             torch.cuda.empty_cache()
 
 
+_FULL = ("can't allocate memory", "not enough memory", "CUDA error: out of memory", "STATUS_ALLOC_FAILED")
+"""Parts of errors of torch, CUDA and its libraries that mean a full memory."""
+
+
 def ran_out_of_memory(error: BaseException) -> bool:
     """Return whether an error means that the GPU or the machine is out of memory."""
     import torch
 
     if isinstance(error, MemoryError | torch.cuda.OutOfMemoryError):
         return True
-    return "can't allocate memory" in str(error) or "not enough memory" in str(error)
+    return any(words in str(error) for words in _FULL)

@@ -43,7 +43,10 @@ def bytes_of(model: Lang3DXLModel, pixels: int) -> tuple[float, float]:
 def memory_to_plan_with(device: torch.device) -> float:
     """Return the bytes of the device that training may fill."""
     if device.type == "cuda":
-        return SHARE * torch.cuda.mem_get_info(device)[0] - CONTEXT
+        torch.cuda.empty_cache()  # what preparing the targets took
+        # What the model takes already is part of the plan.
+        there = torch.cuda.mem_get_info(device)[0] + torch.cuda.memory_allocated(device)
+        return SHARE * there - CONTEXT
     return MAIN_SHARE * machine_memory()
 
 

@@ -29,6 +29,8 @@ class ClipTarget:
     """Mean share of the crops' area inside the photo, 0..1; the rest of a crop is black."""
 
 
+_MOST_SHRUNK = 47
+"""Largest factor by which CUDA's antialiased bicubic resize can shrink."""
 HALF, THIRD = 2, 3
 """Spacing of crops: the number of steps from center to center that make up a crop's side."""
 MOST_CROPS: dict[Quality, float] = {"fast": 700, "normal": 2_500, "fine": math.inf}
@@ -65,11 +67,15 @@ def iterate_crops(
     photo: Float[Tensor, "h w 3"], side: int, size: int, batch_size: int, steps: int = HALF
 ) -> Iterator[Float[Tensor, "n 3 s s"]]:
     """Yield the photo's crops, row by row from the top left, at `size` pixels, `batch_size` at a time, black
-    outside the photo. CLIP's own antialiased bicubic resize is used, then clamped to 0..1."""
+    outside the photo. CLIP's own antialiased bicubic resize is used, then clamped to 0..1; what it would
+    shrink too far is averaged first."""
     windows, tops, lefts = _windows(photo, side, steps)
     columns = len(lefts)
     for batch in torch.arange(len(tops) * columns, device=photo.device).split(batch_size):
         crops = windows[:, tops[batch // columns], lefts[batch % columns]].transpose(0, 1)
+        if (parts := -(-crops.shape[-1] // (_MOST_SHRUNK * size))) > 1:
+            smaller = crops.shape[-1] // parts
+            crops = F.interpolate(crops, (smaller, smaller), mode="area")
         if crops.shape[-1] != size:
             crops = F.interpolate(crops, (size, size), mode="bicubic", align_corners=False, antialias=True)
         yield crops.clamp(0, 1)

@@ -527,6 +527,7 @@ class Scene:
         pairs = zip(listed, photos, strict=True)
         weights = [Weights.of(example, photo, self.splats, self.backend) for example, photo in pairs]
         if selection is not None:
+            selection = torch.as_tensor(selection, device=self.device)
             weights = [Weights(w.seen * selection, torch.zeros_like(w.seen), w.seen) for w in weights]
         queries = self.text.plain_queries([prompt.text]).to(self.device)
         learned = learn(prompt.text, listed, weights, self.engine, queries)

@@ -165,9 +165,11 @@ def _composite_with_gsplat(
     """Composite like `_composite` by gsplat's kernels, in float32."""
     from gsplat import rasterization
 
-    device = gaussians.means.device
+    device, quats = gaussians.means.device, gaussians.quats.float()
+    still = (quats == 0).all(1, keepdim=True)  # no rotation, of which gsplat makes NaN
+    quats = torch.cat([quats[:, :1] + still, quats[:, 1:]], dim=1)
     maps, alpha, info = rasterization(
-        means=gaussians.means.float(), quats=gaussians.quats.float(), scales=gaussians.scales.float(),
+        means=gaussians.means.float(), quats=quats, scales=gaussians.scales.float(),
         opacities=gaussians.opacities.float(), colors=channels.float(),
         viewmats=to_device(camera.view_matrix, device).float()[None],
         Ks=to_device(camera.intrinsics, device).float()[None], width=camera.width, height=camera.height,

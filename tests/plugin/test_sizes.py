@@ -59,3 +59,15 @@ def test_the_time_of_training_is_told_before_it_and_telling_changes_nothing(scen
     assert "about 2.5 hours for 3,000 iterations" in said[-1]
     assert torch.equal(torch.get_rng_state(), random) and model.training
     torch.testing.assert_close(dict(model.state_dict()), before, rtol=0, atol=0, equal_nan=True)
+
+
+def test_a_gpus_plan_counts_what_the_run_itself_takes_and_gave_back(monkeypatch):
+    """So a run that prepares targets may have as many Gaussians as the next one, and a resumed run too."""
+    held = {"free": 2e9, "cached": 5e9}
+    monkeypatch.setattr(
+        torch.cuda, "empty_cache", lambda: held.update(free=held["free"] + held.pop("cached", 0))
+    )
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (held["free"], 16e9))
+    monkeypatch.setattr(torch.cuda, "memory_allocated", lambda device: 1e9)
+    planned = sizes.memory_to_plan_with(torch.device("cuda"))
+    assert planned == pytest.approx(sizes.SHARE * 8e9 - sizes.CONTEXT)

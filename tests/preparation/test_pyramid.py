@@ -169,3 +169,13 @@ def test_the_encoder_never_sees_more_than_a_batch_and_needs_no_gradient():
     target = build_clip_target(photo, [32, 50], encode, 16, batch_size=9)
     assert max(seen) == 9
     assert not target.features.requires_grad
+
+
+def test_a_crop_that_is_shrunk_a_hundredfold_is_averaged_and_not_refused():
+    """CUDA's resize refuses it."""
+    photo = torch.linspace(0.1, 0.9, 1440)[:, None, None].expand(1440, 1440, 3)
+    (crops,), centers = iterate_crops(photo, 480, 4, 99), crop_centers(1440, 480)
+    k, middle = len(centers) // 2, int(centers[len(centers) // 2])
+    seen = photo[middle - 240 : middle + 240, :480].permute(2, 0, 1)
+    expected = F.interpolate(seen[None], (4, 4), mode="area")[0]
+    torch.testing.assert_close(crops[k * len(centers) + k], expected, atol=0.02, rtol=0)

@@ -295,3 +295,13 @@ def test_clicks_are_not_lost_among_the_gaussians_of_an_outline(monkeypatch):
     clicked = sampled[photos[1].word > 0]
     assert set(clicked.tolist()) == set(rows[click > 0].tolist())
     assert all(float(part.sum()) == pytest.approx(1) for one in photos for part in (one.word, one.rest))
+
+
+def test_a_selection_may_be_numpys(scene):
+    """As `Found.gaussians` is."""
+    chosen = painted(1)
+    example = Example(ALL, points=(pixel(scene, ALL, 1.5, 1.5),))
+    words = [
+        scene.teach("gizmo", example, selection=mask).words["gizmo"] for mask in (chosen, chosen.numpy())
+    ]
+    assert torch.equal(words[0].vector, words[1].vector)

@@ -91,3 +91,23 @@ def test_the_torch_backend_gives_the_same_on_a_gpu_as_on_the_cpu():
     on_gpu = cloud.render(rasterize, cloud.leaves(), backend="torch")
     for name, value in maps(on_cpu).items():
         torch.testing.assert_close(getattr(on_gpu, name).cpu(), value, atol=1e-9, rtol=0)
+
+
+def test_gaussians_without_rotation_are_drawn_unrotated(monkeypatch):
+    """gsplat's kernels divide by the length of a quaternion."""
+
+    def of_unit_length(*arguments, **named):
+        assert (named["quats"].norm(dim=1) > 0).all()
+        return stand_in(*arguments, **named)
+
+    monkeypatch.setattr("gsplat.rasterization", of_unit_length)
+    n, camera = 20, Camera(torch.eye(4), torch.tensor([[30.0, 0, 20], [0, 30.0, 15], [0, 0, 1]]), 40, 30)
+    draw = torch.Generator().manual_seed(0)
+    means = torch.rand(n, 3, generator=draw) + torch.tensor([-0.5, -0.5, 2.0])
+    scales, half = 0.1 * torch.rand(n, 3, generator=draw), torch.full((n,), 0.5)
+    drawn = [
+        rasterize(Gaussians(means, quats, scales, half), camera, torch.ones(n, 3), backend="gsplat").image
+        for quats in (torch.zeros(n, 4), torch.eye(4)[:1].expand(n, 4))
+    ]
+    assert drawn[0].any()
+    torch.testing.assert_close(drawn[0], drawn[1])
