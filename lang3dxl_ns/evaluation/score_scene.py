@@ -59,6 +59,9 @@ def score_scene(
         "split": split,
         "evaluated_photos": len(photos),
         "taught_words": [word.name for word in words if word is not None],
+        "photos_that_taught": sorted(
+            figures.keys() & {e.photo for word in words if word for e in word.examples}
+        ),
         **scorer.protocol(mask if masked else "none"),
     }
     return figures, protocol

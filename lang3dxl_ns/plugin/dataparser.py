@@ -82,7 +82,8 @@ class PhotoCollectionDataParser(ColmapDataParser):
         if not data.is_dir():
             raise UserError(f"{data} is not a folder: pass the one that holds images/ and sparse/0 as --data")
         named = self.config.colmap_path
-        self.config.colmap_path = find_colmap_model(data, _places(named)) or named
+        if named == type(self.config)().colmap_path:  # none was named
+            self.config.colmap_path = find_colmap_model(data) or named
         self.config.images_path = images_path(data, self.config.images_path)
         _ = self.reconstruction  # read before the parent looks for anything
         # The parent would require a mask for every photo; here masks are optional and found per photo.
@@ -280,12 +281,6 @@ def recorded_scene(run: Path | None) -> RecordedSceneDataParserConfig | None:
     return RecordedSceneDataParserConfig(run=run)
 
 
-def _places(named: Path) -> list[Path]:
-    """Return where to look for a model: in the folder that was named, or else in the usual ones."""
-    usual = named == PhotoCollectionDataParserConfig().colmap_path
-    return [named, *MODEL_FOLDERS, OWN_MODEL] if usual else [named]
-
-
 # ── the choice for --data ─────────────────────────────────────────────────────────────────────────────────
 
 
@@ -298,18 +293,19 @@ def parser_for(
     data = expanded(parser.data).absolute()
     if is_video(data) or (not data.exists() and frames_folder(data).is_dir()):
         data = parser.data = extract_frames(data) if may_reconstruct else frames_folder(data)
-    named, usual = parser.colmap_path, type(parser)().colmap_path
-    folders = _places(named)
+    if parser.colmap_path != type(parser)().colmap_path:  # named, or found when its run began
+        return parser
+    folders = [*MODEL_FOLDERS, OWN_MODEL]
     work = None if cache_dir is None else expanded(cache_dir).absolute() / "reconstruction"
-    if work is not None and named == usual and data.is_dir() and shows_these(work, data):
+    if work is not None and data.is_dir() and shows_these(work, data):
         folders.append(work / "sparse/0")
     known = find_colmap_model(data, folders)
     if known is not None:
         parser.colmap_path = known
-    elif named == usual and (data / TRANSFORMS).is_file():
+    elif (data / TRANSFORMS).is_file():
         CONSOLE.log(f"{data} has a {TRANSFORMS} and no COLMAP model: read as nerfstudio-data")
         return NerfstudioDataParserConfig(data=data)
-    elif may_reconstruct and named == usual and data.is_dir() and find_photos(data).names:
+    elif may_reconstruct and data.is_dir() and find_photos(data).names:
         data, model = reconstruct_scene(data, cache_dir)
         parser.colmap_path = model.relative_to(data) if model.is_relative_to(data) else model
     elif may_reconstruct and data.is_dir() and not any(data.iterdir()):

@@ -31,7 +31,7 @@ from lang3dxl_ns.plugin.dataparser import RecordedSceneDataParserConfig
 from lang3dxl_ns.plugin.load_scene import NOT_FINISHED
 from lang3dxl_ns.plugin.model import Lang3DXLModel
 from lang3dxl_ns.plugin.photo_dataset import EvalPhotos
-from lang3dxl_ns.preparation.targets import Batch
+from lang3dxl_ns.preparation.targets import Batch, foreground
 from lang3dxl_ns.query.engine import QueryEngine, make_engine
 from lang3dxl_ns.query.relevancy import Queries
 from lang3dxl_ns.scene.camera import Camera
@@ -129,8 +129,8 @@ class Evaluation:
         protocol = HalfImageProtocol(
             model.splats(), model.appearance, model.image_metrics, background, weight, model.backend
         )
-        mask = batch["mask"][..., 0] if "mask" in batch else None
-        return protocol.measure(to_rasterizer(camera), model.get_gt_img(batch["image"]), mask)
+        photo = model.get_gt_img(batch["image"])
+        return protocol.measure(to_rasterizer(camera), photo, foreground(batch))
 
     def _photos_of(self, split: Split) -> EvalPhotos:
         if split != "seen":
@@ -176,7 +176,7 @@ class Evaluation:
         photo: Photo,
     ) -> None:
         size = scorer.truth.scoring_size(photo.height, photo.width)
-        keep = batch["mask"][..., 0] if "mask" in batch else None
+        keep = foreground(batch)
         start = perf_counter()
         asked = scorer.queries.to(self._model.device)
         raw = scorer.named(self.relevancy(camera, asked, scorer.yardstick), size)

@@ -40,7 +40,7 @@ from lang3dxl_ns.plugin.optimizers import semantic_ramp
 from lang3dxl_ns.plugin.optional_components import build_components, component_parameters, match_components
 from lang3dxl_ns.plugin.rendering_model import RenderingModel
 from lang3dxl_ns.plugin.splatfacto import SplatfactoModel
-from lang3dxl_ns.preparation.targets import Batch
+from lang3dxl_ns.preparation.targets import Batch, foreground
 
 LONGER_SIDE = 1_600
 """Longer side in pixels to which larger photos are reduced for gathering: a CLIP crop covers hundreds of
@@ -124,7 +124,7 @@ class Lang3DXLModel(RenderingModel):
             (int(camera.height.item()), int(camera.width.item())),
             batch["clip_target"],
             batch.get("dense_target"),
-            batch["mask"][..., 0] if "mask" in batch else None,
+            foreground(batch),
         )
 
     def forget_gathered_codes(self) -> None:
@@ -144,7 +144,7 @@ class Lang3DXLModel(RenderingModel):
         self, outputs: dict, batch: Batch, metrics_dict: dict | None = None
     ) -> dict[str, Tensor]:
         """Compute the color loss and, if there are semantics, the semantic losses, all already weighted."""
-        mask = batch["mask"][..., 0] if "mask" in batch else None
+        mask = foreground(batch)
         with part("losses"):
             target = self.composite_with_background(self.get_gt_img(batch["image"]), outputs["background"])
             loss = {"rgb": losses.rgb_loss(outputs["rgb"], target, mask, self.config.ssim_lambda)}
@@ -206,8 +206,7 @@ class Lang3DXLModel(RenderingModel):
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
         """Evaluate a held-out photo: PSNR, SSIM, and LPIPS if its weights are available."""
         target, predicted = self.get_gt_img(batch["image"]), outputs["rgb"]
-        mask = batch["mask"][..., 0] if "mask" in batch else None
-        metrics = self.image_metrics(predicted, target, mask)
+        metrics = self.image_metrics(predicted, target, foreground(batch))
         images = {"img": torch.cat([target, predicted], dim=1)}
         if "bottleneck" in outputs:
             images["bottleneck"] = outputs["bottleneck"]
@@ -217,7 +216,7 @@ class Lang3DXLModel(RenderingModel):
     def corrected_psnr(self, outputs: dict, batch: Batch) -> float:
         """Compute PSNR with matched colors, which takes seconds for a large photo; only `ns-eval` does."""
         photo = self.get_gt_img(batch["image"])
-        pixels = reached(photo, batch["mask"][..., 0] if "mask" in batch else None)
+        pixels = reached(photo, foreground(batch))
         # Colors are matched on the CPU, whose solver also handles pictures of a single color.
         target, predicted = photo[pixels].cpu(), outputs["rgb"][pixels].cpu()
         return float(psnr(color_correct(predicted, target), target))
@@ -244,7 +243,7 @@ class Lang3DXLModel(RenderingModel):
         if self.carried is None or "clip_target" not in batch:
             return {}
         assert self.config.decode_size is not None
-        mask = batch["mask"][..., 0] if "mask" in batch else None
+        mask = foreground(batch)
         clip, dense, small_mask = self._feature_maps(camera, self.config.decode_size[1], mask)
         target = batch["clip_target"]
         predicted, weight = match(clip, target, batch["crop_sides"], small_mask)

@@ -37,7 +37,7 @@ from lang3dxl_ns.components.step_guard import StepGuard
 from lang3dxl_ns.plugin.optimizers import GuardedOptimizers, add_rows_to_state
 from lang3dxl_ns.plugin.pipeline import Lang3DXLPipeline
 from lang3dxl_ns.plugin.sizes import plan
-from lang3dxl_ns.preparation.needs import write_needs
+from lang3dxl_ns.preparation.needs import NEEDS_FILE, write_needs
 from lang3dxl_ns.preparation.store import PhotosGoneError
 from lang3dxl_ns.query.run_checkpoint import NOT_A_CHECKPOINT, check_checkpoint, read_checkpoint
 from lang3dxl_ns.query.run_file import SCENE_FILE, SceneFile
@@ -49,6 +49,8 @@ to 2.7 on landmarks and `castle`, and 3.0 for `paper` on a landmark, measured on
 RENDERINGS_PER_PHOTO = 30.0
 """Duration of reading a photo's features onto the Gaussians, in renderings of it: measured 30 on one core for
 160 channels, 18,000 Gaussians, 240×180 pixels."""
+_BEFORE_TRAINING = ("config.yml", SCENE_FILE, f"{NEEDS_FILE}.*", "dataparser_transforms.json", "events.*")
+"""Names of a run's files that are written before training."""
 
 
 class _Stopped(BaseException):
@@ -163,11 +165,13 @@ class Lang3DXLTrainer(Trainer):
             _restore(self.pipeline, self._run_state)
 
     def _forget_folder(self) -> None:
-        """Remove the folder of a run that could not start, if it holds nothing but its settings, and the
-        folders above that this leaves empty."""
+        """Remove the folder of a run that could not start, if it holds nothing but what is written before
+        training, and the folders above that this leaves empty."""
         with suppress(OSError):
-            if {path.name for path in self.base_dir.iterdir()} <= {"config.yml"}:
-                (self.base_dir / "config.yml").unlink(missing_ok=True)
+            files = list(self.base_dir.iterdir())
+            if all(any(path.match(name) for name in _BEFORE_TRAINING) for path in files):
+                for path in files:
+                    path.unlink()
                 for folder in (self.base_dir, *self.base_dir.parents[:3]):
                     folder.rmdir()  # the first folder that is not empty raises, and ends the loop
 
@@ -265,6 +269,7 @@ class Lang3DXLTrainer(Trainer):
         signal stopped the run: 130 for Ctrl-C, 143 for SIGTERM."""
         total = self.config.max_num_iterations
         if self.is_finished:
+            self._forget_folder()
             raise UserError(
                 f"the checkpoint in {self.config.load_dir or self.config.load_checkpoint} already has "
                 f"{self._start_step} iterations, and the run has {total}: "

@@ -154,6 +154,11 @@ class Batch(_Photo, total=False):
     """Region labels, −1 for none."""
 
 
+def foreground(batch: Batch) -> Bool[Tensor, "h w"] | None:
+    """Return a photo's foreground; None if it is the whole photo."""
+    return batch["mask"][..., 0] if "mask" in batch else None
+
+
 @dataclass
 class SceneFacts:
     """Facts about a scene from which a model is built, beside its settings and the scene's points."""

@@ -62,6 +62,7 @@ def reconstruct(
     settings = settings or ReconstructionSettings()
     if model.exists() and (model_in(model) or any(model.iterdir())):
         raise UserError(f"{model} already exists and is left alone; remove it to reconstruct the photos anew")
+    say(f"{len(photos.names)} photos in {photos.folder}, without a COLMAP model: reconstructing")
     good, left_out = _usable(photos)
     with _quiet(), measure() as clock:
         with part("features"):
@@ -110,7 +111,6 @@ def reconstruct_scene(
     model = data / "sparse"
     if not os.access(data, os.W_OK) or (model.exists() and not model_in(model)):
         model = work / "sparse"
-    say(f"{len(photos.names)} photos in {photos.folder}, without a COLMAP model: reconstructing")
     with locked(work, busy=f"another command reconstructs in {work}: wait for it, or end it"):
         report = reconstruct(photos, work, model, settings)
     say(*report.lines())

@@ -14,6 +14,7 @@ from lang3dxl_ns.evaluation.ground_truth import GroundTruth
 from lang3dxl_ns.evaluation.score_scene import box_iou, score_scene, score_selections
 from lang3dxl_ns.query.places import Box
 from lang3dxl_ns.query.run_file import ScenePhoto
+from lang3dxl_ns.query.teach import Example
 from lang3dxl_ns.scene.camera import Lens
 from lang3dxl_ns.scene.photo import Photo
 
@@ -66,6 +67,15 @@ def test_a_label_that_fits_two_photos_of_a_scene_file_is_refused_and_one_that_fi
     scene.file.photos[index] = replace(scene.photos[index], name="left/0001.png")
     with pytest.raises(UserError, match=r"left/0001 in .* fits both"):
         score_scene(scene, truth)
+
+
+def test_scored_photos_whose_marks_taught_a_word_are_told(tmp_path):
+    scene = painted_scene()
+    truth = label(scene, tmp_path)
+    mark = Example("all/0003.jpg", np.asarray(Image.open(tmp_path / "dome/all/0003.png")) > 0)
+    _, protocol = score_scene(scene.teach("dome", mark), truth)
+    assert protocol["photos_that_taught"] == ["all/0003.jpg"]
+    assert score_scene(scene, truth)[1]["photos_that_taught"] == []
 
 
 def test_labels_elsewhere_get_none(tmp_path):

@@ -54,11 +54,13 @@ def test_a_run_that_dies_while_it_learns_words_resumes_with_words_only(trained, 
         run(load_dir=folders[1])
 
 
-def test_a_run_of_fewer_iterations_than_its_checkpoint_is_refused(trained, train, scene):
+def test_a_run_of_fewer_iterations_than_its_checkpoint_is_refused(trained, train, scene, tmp_path):
+    """And leaves no folder, which would pass for the newest run."""
     run, folders = trained
     run(semantics=False)
     with pytest.raises(UserError, match=f"already has {STEPS} iterations, and the run has {STEPS - 1}"):
-        train(scene, iterations=STEPS - 1, load_dir=folders[0], semantics=False)
+        train(scene, STEPS - 1, tmp_path / "refused", load_dir=folders[0], semantics=False)
+    assert not list((tmp_path / "refused").rglob("*.yml"))
 
 
 def test_words_of_a_run_that_is_prolonged_are_learned_anew(trained, train, scene, monkeypatch):

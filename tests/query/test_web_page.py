@@ -610,15 +610,20 @@ def test_an_over_long_phrase_is_cut_before_it_is_sent(browser, address):
 
 
 def test_a_page_of_other_people_is_not_replaced(scene, tmp_path):
-    for name in ("index.html", "scene.json", "page.css", "views.bin", "look0.bin", "vocabulary.json"):
+    for name in ("index.html", "scene.json", "page.css", "views.bin", "vocabulary.json", "photo.JPG"):
         folder = tmp_path / name.partition(".")[0]
         folder.mkdir()
         (folder / name).write_text("mine")
         with pytest.raises(UserError, match=rf"holds {name}, which is not a scene's page"):
             write_page(Page(scene), folder)
         assert [path.read_text() for path in folder.iterdir()] == ["mine"]
-    for _ in range(2):  # the second over its own
+    (tmp_path / "own").mkdir()
+    (tmp_path / "own" / "CNAME").write_text("mine")
+    for _ in range(2):  # the second over its own, without what is left of another scene's page
         write_page(Page(scene), tmp_path / "own")
+        left = {path.name for path in (tmp_path / "own").iterdir()}
+        (tmp_path / "own" / "look7.bin").touch()
+    assert "look7.bin" not in left and "CNAME" in left
 
 
 def test_a_page_whose_writing_was_stopped_is_written_again(scene, tmp_path, monkeypatch):

@@ -119,11 +119,12 @@ def test_names_with_spaces_formats_of_the_web_and_odd_bytes(photos):
     assert all(line.isprintable() for line in report.lines())
 
 
-def test_a_model_that_is_there_is_left_as_it_is(photos):
+def test_a_model_that_is_there_is_left_as_it_is(photos, capsys):
     (photos / "sparse" / "0").mkdir(parents=True)
     (photos / "sparse" / "0" / "images.bin").write_bytes(b"precious")
     with pytest.raises(UserError, match="already exists"):
-        reconstruct(find_photos(photos), photos / "work", photos / "sparse")
+        reconstruct_scene(photos)
+    assert "without a COLMAP model" not in capsys.readouterr().out
     assert (photos / "sparse" / "0" / "images.bin").read_bytes() == b"precious"
 
 

@@ -46,8 +46,9 @@ export function promptCard(prompt, { fly, remove, rename, setThreshold, teach, u
   if (threshold == null) return card;
   const slider = element("input", { type: "range", min: 0, max: 1, step: 0.01, value: threshold, ariaLabel: `Threshold of ${shown(text)}` });
   slider.addEventListener("change", () => setThreshold(prompt, Number(slider.value)));
-  const ends = [threshold, Math.max(peak, threshold)].map((value) => element("span", {}, value.toFixed(2)));
-  card.append(element("div", { className: "ends" }, ends[0], element("div", { className: "heat" }), ends[1]),
+  const ends = [threshold, peak].map((value) => element("span", {}, value.toFixed(2)));
+  if (peak > threshold) card.append(element("div", { className: "ends" }, ends[0], element("div", { className: "heat" }), ends[1]));
+  card.append(
     element("p", {}, `${doubtIn(prompt)} ${matching.toLocaleString("en")} Gaussians match.`),
     element("label", {}, "Threshold", slider)); // prettier-ignore
   return card;

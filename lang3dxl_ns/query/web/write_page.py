@@ -37,6 +37,7 @@ from lang3dxl_ns.query.web.pack import (
     pack_splats,
     pack_view,
 )
+from lang3dxl_ns.scene.photo_folder import PHOTO_SUFFIXES
 
 _HERE = Path(__file__).parent
 _INDEX = _HERE / "index.html"
@@ -222,14 +223,19 @@ def _distinct(phrases: Sequence[str]) -> list[str]:
 
 def write_page(page: Page, folder: Path) -> int:
     """Write a page's files into a folder for any static web server; return the number of bytes. Raises
-    UserError for a folder that has files of these names and is not such a page."""
+    UserError for a folder that has files of these names, or pictures, and is not such a page."""
     make_folder(folder)
     index, names = folder / _INDEX.name, {*(path.name for path in _FILES), "scene.json", "vocabulary.json"}
     ours = index.is_file() and "<title>A scene to ask</title>" in index.read_text(errors="replace")
-    taken = sorted(path.name for path in folder.iterdir() if path.name in names or path.suffix == ".bin")
+    other = (".bin", *PHOTO_SUFFIXES)  # whoever serves a folder of photos would publish them
+    here = sorted(folder.iterdir())
+    taken = [path.name for path in here if path.name in names or path.suffix.lower() in other]
     if taken and not ours:
         raise UserError(f"{folder} holds {taken[0]}, which is not a scene's page: name a folder of its own")
     files = page.files()
     for name, content in files.items():
         write_atomically(folder / name, content)
+    for path in here:  # of the page that this one replaces
+        if path.suffix == ".bin" and path.name not in files:
+            path.unlink()
     return sum(map(len, files.values()))
