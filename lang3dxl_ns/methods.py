@@ -14,8 +14,8 @@ from nerfstudio.plugins.types import MethodSpecification
 from lang3dxl_ns.common.settings_help import asked_for_all
 from lang3dxl_ns.plugin.optimizers import RunAdamConfig, RunScheduleConfig, parameter_groups
 from lang3dxl_ns.plugin.pipeline import Lang3DXLPipelineConfig
+from lang3dxl_ns.plugin.run_settings import check_command_line
 from lang3dxl_ns.plugin.trainer_config import Lang3DXLTrainerConfig
-from lang3dxl_ns.query.run_settings import check_command_line
 
 check_command_line(sys.argv[1:])
 

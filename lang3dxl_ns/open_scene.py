@@ -11,10 +11,10 @@ from lang3dxl_ns.common.console import silence_libraries
 from lang3dxl_ns.common.device import best_device
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import expanded
+from lang3dxl_ns.files.runs import OUTPUTS, find_config
+from lang3dxl_ns.files.scene_file import SUFFIX, Provenance, describe_scene_file, read_scene
 from lang3dxl_ns.query.question import QueryConfig
-from lang3dxl_ns.query.run_file import OUTPUTS, find_config
 from lang3dxl_ns.query.scene import Scene, text_encoder
-from lang3dxl_ns.query.scene_file import SUFFIX, Provenance, describe_scene_file, read_scene
 
 
 def load_scene(

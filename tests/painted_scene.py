@@ -14,10 +14,10 @@ from torch import Tensor
 from lang3dxl_ns.components.appearance import AppearanceConfig, AppearanceField
 from lang3dxl_ns.components.feature_decoder import Decoder
 from lang3dxl_ns.query.question import QueryConfig
-from lang3dxl_ns.query.run_file import SceneFile, ScenePhoto
 from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.rendering import Splats, harmonics_of
 from lang3dxl_ns.scene.camera import Lens, camera_to_world
+from lang3dxl_ns.scene.record import ScenePhoto, SceneRecord
 
 WORDS = ("wall", "dome", "window", "object")
 DISTANCE = 5.0
@@ -106,14 +106,14 @@ def photo(name: str, x: float, y: float, split="train", focal: int = 96, size: i
     return ScenePhoto(name, split, camera_to_world(view).tolist(), lens)
 
 
-def painted_file() -> SceneFile:
+def painted_file() -> SceneRecord:
     photos = [
         photo("left/0001.jpg", -1.5, -1),
         photo("right/0002.jpg", 1.5, 1.5),
         photo("all/0003.jpg", 0, 0, focal=70),
     ]
     photos.append(photo("held/0004.jpg", 0.5, 0.5, "eval"))
-    return SceneFile(photos, "clip", "0123", 1.0, torch.eye(4)[:3].tolist(), "nowhere")
+    return SceneRecord(photos, "clip", "0123", 1.0, torch.eye(4)[:3].tolist(), "nowhere")
 
 
 def painted_scene(cache: Path | None = None, config: QueryConfig | None = None, **changes) -> Scene:

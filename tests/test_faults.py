@@ -22,13 +22,13 @@ from lang3dxl_ns.common.memory import machine_memory, with_less_memory
 from lang3dxl_ns.methods import lang3dxl
 from lang3dxl_ns.plugin.dataparser import PhotoCollectionDataParserConfig
 from lang3dxl_ns.plugin.nerfstudio_scenes import photos_of
+from lang3dxl_ns.plugin.run_checkpoint import check_checkpoint
 from lang3dxl_ns.plugin.trainer_config import read_config
 from lang3dxl_ns.preparation.foreground import with_foreground
 from lang3dxl_ns.preparation.pyramid import build_clip_target
 from lang3dxl_ns.preparation.settings import PreparationConfig
 from lang3dxl_ns.preparation.store import FeatureStore
 from lang3dxl_ns.query.relevancy import Queries, cosines_of_codes
-from lang3dxl_ns.query.run_checkpoint import check_checkpoint
 
 
 @pytest.fixture

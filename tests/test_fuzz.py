@@ -24,16 +24,17 @@ from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.pictures import FORMATS
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth
 from lang3dxl_ns.methods import lang3dxl
+from lang3dxl_ns.plugin.run_checkpoint import check_checkpoint, read_checkpoint
 from lang3dxl_ns.plugin.trainer_config import read_config
+from lang3dxl_ns.plugin.viewer_guard import Guard, is_camera
 from lang3dxl_ns.preparation.regions import FolderRegions
 from lang3dxl_ns.preparation.store import FeatureStore
-from lang3dxl_ns.query.run_checkpoint import check_checkpoint, read_checkpoint
-from lang3dxl_ns.query.run_file import SceneFile, ScenePhoto, read_camera_path
-from lang3dxl_ns.query.web.viewer_guard import Guard, is_camera
 from lang3dxl_ns.scene.camera import Lens
+from lang3dxl_ns.scene.camera_path import read_camera_path
 from lang3dxl_ns.scene.colmap import read_reconstruction
 from lang3dxl_ns.scene.companions import companion, inside
 from lang3dxl_ns.scene.photo import Photo
+from lang3dxl_ns.scene.record import ScenePhoto, SceneRecord
 
 INPUTS = int(os.environ.get("LANG3DXL_FUZZ", "60"))
 """Inputs per reader."""
@@ -179,7 +180,7 @@ def test_presets(content, tmp_path, monkeypatch):
 def test_scene_files_and_camera_paths(content, tmp_path):
     (tmp_path / "a.json").write_bytes(content)
     with only_user_errors():
-        SceneFile.read(tmp_path / "a.json")
+        SceneRecord.read(tmp_path / "a.json")
     with only_user_errors():
         read_camera_path(tmp_path / "a.json")
 
@@ -209,11 +210,11 @@ POSE = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 2.0]]
 def test_scene_files_in_use(tmp_path, data):
     lens = Lens(24, 16, 20.0, 21.0, 12.0, 8.0, (0.1, 0.0, 0.0, 0.0))
     photos = [ScenePhoto(f"{i}.jpg", "train", POSE, lens, str(tmp_path / "mask.png")) for i in range(2)]
-    SceneFile(photos, "clip", "identity", 1.0, POSE, "data").write(tmp_path / "whole.json")
+    SceneRecord(photos, "clip", "identity", 1.0, POSE, "data").write(tmp_path / "whole.json")
     document = json.loads((tmp_path / "whole.json").read_text())
     (tmp_path / "a.json").write_text(json.dumps(data.draw(altered(document))))
     with only_user_errors():
-        scene = SceneFile.read(tmp_path / "a.json")
+        scene = SceneRecord.read(tmp_path / "a.json")
         for photo in scene.photos:
             assert scene.photo(photo.name) is photo
             assert photo.camera.at_origin(torch.zeros(1))[1].isfinite().all()

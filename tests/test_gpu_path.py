@@ -349,7 +349,7 @@ def test_a_conversation_in_the_viewer(default, gpu):
 
     from scenes import view_of
 
-    from lang3dxl_ns.query.conversation import Conversation
+    from lang3dxl_ns.plugin.conversation import Conversation
 
     pipeline = default.pipeline
     model = pipeline.model.eval()
@@ -371,7 +371,7 @@ def test_a_conversation_in_the_viewer(default, gpu):
 def test_words_are_learned_where_memory_is_short(trained, monkeypatch, name, width, memory):
     """Wide features as principal components, a few channels at a time, sums on the CPU."""
     monkeypatch.setattr(CompressedField, "gathered_channels", 5)
-    monkeypatch.setattr("lang3dxl_ns.components.learn_codes.DENSE_AXES", 3)
+    monkeypatch.setattr("lang3dxl_ns.training.learn_codes.DENSE_AXES", 3)
     monkeypatch.setattr("lang3dxl_ns.rendering.gathering.MEMORY", memory)
     model = trained(iterations=3, pipeline__model__decoder__name=name).pipeline.model
     codes = model.gauss_params["codes"]

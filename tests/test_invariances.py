@@ -11,7 +11,7 @@ from scenes import write_scene
 from lab.numerics.rasterizer import Scene
 from lang3dxl_ns.components.semantic_field import SemanticField, SemanticFieldConfig
 from lang3dxl_ns.plugin.dataparser import PhotoCollectionDataParserConfig
-from lang3dxl_ns.preparation.crop_sizes import (
+from lang3dxl_ns.preparation.physical_scale import (
     crop_sides,
     physical_scales,
     pixel_sizes,

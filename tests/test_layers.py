@@ -38,7 +38,8 @@ ORDER = (
     {"scene"},
     {"components", "rendering"},
     {"preparation"},
-    {"query", "evaluation"},
+    {"query", "words", "files", "web", "evaluation"},
+    {"training"},
     {"attachment"},
     {"plugin"},
     {"methods", "open_scene"},
@@ -137,11 +138,11 @@ def all_imports(source: str, modules) -> set[str]:
 
 
 def test_public_names_load_at_first_use_and_rooms_below_the_plugin_load_neither_nerfstudio_nor_cuda_code():
-    below = ("common", "scene", "components", "rendering", "preparation", "query", "evaluation")
+    below = ("common", "scene", "components", "rendering", "preparation", "query", "words", "files", "web")
     code = f"""
 import importlib, json, sys, lang3dxl_ns
 assert "torch" not in sys.modules
-for name in {modules(*below, "attachment")}: importlib.import_module(name)
+for name in {modules(*below, "evaluation", "training", "attachment")}: importlib.import_module(name)
 print(json.dumps(sorted({{m.split(".")[0] for m in sys.modules}})))
 assert all(getattr(lang3dxl_ns, name) is not None for name in lang3dxl_ns.__all__)
 """

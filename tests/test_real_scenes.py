@@ -5,7 +5,7 @@ import shutil
 
 import pytest
 
-from lang3dxl_ns.preparation.crop_sizes import pixel_sizes, propose_scale_range
+from lang3dxl_ns.preparation.physical_scale import pixel_sizes, propose_scale_range
 from lang3dxl_ns.scene.colmap import read_reconstruction
 
 

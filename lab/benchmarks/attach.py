@@ -20,9 +20,9 @@ from lang3dxl_ns.common.settings_help import showing
 from lang3dxl_ns.evaluation.aggregate import average
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth, find_ground_truth
 from lang3dxl_ns.evaluation.scores import LanguageScorer, open_scorer
+from lang3dxl_ns.files.scene_file import read_scene
 from lang3dxl_ns.open_scene import find_scene_file
 from lang3dxl_ns.query.scene import Scene
-from lang3dxl_ns.query.scene_file import read_scene
 from lang3dxl_ns.scene.camera import Camera
 
 

@@ -28,9 +28,9 @@ from lang3dxl_ns.components.compression import CompressedField
 from lang3dxl_ns.components.feature_decoder import Gathered
 from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth
+from lang3dxl_ns.files.scene_file import read_scene
 from lang3dxl_ns.query.engine import PerGaussian, QueryEngine, make_engine
 from lang3dxl_ns.query.relevancy import Queries
-from lang3dxl_ns.query.scene_file import read_scene
 
 NOISE = 0.15
 """Noise of repeated features, as a share of the deviation of each channel."""

@@ -30,10 +30,10 @@ from lab.landmark.landmark import Landmark
 from lab.landmark.photography import random_view, take_photo
 from lang3dxl_ns.attachment.learn import prepare_photos, settled
 from lang3dxl_ns.common.console import say
-from lang3dxl_ns.components.learn_codes import DENSE_AXES, sharpen
 from lang3dxl_ns.components.principal_basis import PrincipalBasis
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth
 from lang3dxl_ns.evaluation.score_scene import score_scene
+from lang3dxl_ns.files.scene_file import read_scene
 from lang3dxl_ns.preparation.encoders import (
     DenseEncoder,
     ImageTextEncoder,
@@ -46,12 +46,12 @@ from lang3dxl_ns.preparation.settings import PreparationConfig
 from lang3dxl_ns.preparation.targets import TargetReader
 from lang3dxl_ns.query.engine import PerGaussian
 from lang3dxl_ns.query.relevancy import Queries
-from lang3dxl_ns.query.run_file import ScenePhoto
 from lang3dxl_ns.query.scene import Scene
-from lang3dxl_ns.query.scene_file import read_scene
 from lang3dxl_ns.rendering import composite
 from lang3dxl_ns.rendering.gathering import Pixels, gather
 from lang3dxl_ns.scene.camera import resized
+from lang3dxl_ns.scene.record import ScenePhoto
+from lang3dxl_ns.training.learn_codes import DENSE_AXES, sharpen
 
 TRAINING_SEEDS = range(10_000, 20_000)
 """Landmarks of the built-in encoders' own training."""

@@ -23,7 +23,7 @@ from lang3dxl_ns.common.reports import describe_machine, markdown_table, write_r
 from lang3dxl_ns.common.settings_help import showing
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth
 from lang3dxl_ns.evaluation.scores import average_precision, overlap
-from lang3dxl_ns.query.teach import Box, Example, Point
+from lang3dxl_ns.words.taught_words import Box, Example, Point
 
 if TYPE_CHECKING:
     from lang3dxl_ns.query.scene import Scene

@@ -18,9 +18,9 @@ from lang3dxl_ns.evaluation.ground_truth import GroundTruth
 from lang3dxl_ns.evaluation.score_scene import labeled_photos, truths_of
 from lang3dxl_ns.evaluation.scores import overlap
 from lang3dxl_ns.query.doubt import DOUBTFUL
-from lang3dxl_ns.query.run_file import ScenePhoto
 from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.query.text import Prompt, caution
+from lang3dxl_ns.scene.record import ScenePhoto
 
 USEFUL = 0.3
 """Mean IoU of the masks from which an answer is useful."""

@@ -7,8 +7,8 @@ from painted_scene import painted_file, painted_splats
 
 from lab.benchmarks.attach import AttachBenchmark
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.files.scene_file import write_scene
 from lang3dxl_ns.query.scene import Scene
-from lang3dxl_ns.query.scene_file import write_scene
 
 
 def test_a_scene_without_words_is_refused(tmp_path):

@@ -10,7 +10,7 @@ from PIL import Image
 
 from lab.baselines.lifting import LiftedFeatures
 from lang3dxl_ns.cli import main
-from lang3dxl_ns.query.scene_file import write_scene
+from lang3dxl_ns.files.scene_file import write_scene
 
 
 def label(photo, folder) -> None:

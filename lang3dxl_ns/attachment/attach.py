@@ -19,13 +19,13 @@ from lang3dxl_ns.common.device import best_device
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import expanded, make_folder
 from lang3dxl_ns.common.stages import Stages
+from lang3dxl_ns.files.read_splats import find_splats, read_splats
+from lang3dxl_ns.files.scene_file import Provenance, check_scene_name, replace_scene
 from lang3dxl_ns.preparation.model_files import check_encoders, option_prefix
 from lang3dxl_ns.preparation.photo_collection import PhotoCollection, read_collection
 from lang3dxl_ns.preparation.segmentation import find_text_segmenter, load_text_segmenter
 from lang3dxl_ns.query.match import save_picture
-from lang3dxl_ns.query.read_splats import find_splats, read_splats
 from lang3dxl_ns.query.scene import Scene
-from lang3dxl_ns.query.scene_file import Provenance, check_scene_name, replace_scene
 from lang3dxl_ns.query.text import taught_prompt
 from lang3dxl_ns.rendering import Splats
 from lang3dxl_ns.scene.photo_folder import check_data

@@ -16,20 +16,20 @@ from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.image import resize_nearest
 from lang3dxl_ns.components.decoders import DecoderConfig, make_decoder
 from lang3dxl_ns.components.feature_decoder import Decoder
-from lang3dxl_ns.components.learn_codes import TargetView, learn_codes
 from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
-from lang3dxl_ns.preparation.crop_sizes import plan_crops
 from lang3dxl_ns.preparation.encoders import CLIP_OPTION, find_model, usual_dense
 from lang3dxl_ns.preparation.foreground import with_foreground
 from lang3dxl_ns.preparation.photo_collection import PhotoCollection
+from lang3dxl_ns.preparation.physical_scale import plan_crops
 from lang3dxl_ns.preparation.prepare import prepare
 from lang3dxl_ns.preparation.settings import PreparationConfig
 from lang3dxl_ns.preparation.store import FeatureStore
 from lang3dxl_ns.preparation.targets import TargetReader
-from lang3dxl_ns.query.run_file import SceneFile, ScenePhoto
 from lang3dxl_ns.rendering import Splats, composite
 from lang3dxl_ns.scene.camera import Camera, camera_to_world, resized
 from lang3dxl_ns.scene.photo import Photo
+from lang3dxl_ns.scene.record import ScenePhoto, SceneRecord
+from lang3dxl_ns.training.learn_codes import TargetView, learn_codes
 
 LONGER_SIDE = 800
 """Largest longer side at which photos are gathered, pixels. A fine crop covers dozens of pixels."""
@@ -91,7 +91,7 @@ def scene_file(
     cameras: Mapping[str, Camera],
     similarity: Similarity,
     config: PreparationConfig,
-) -> SceneFile:
+) -> SceneRecord:
     """Describe what a scene keeps of its photos and of the frame, where splat's = similarity · photos'."""
     known = find_model(config.clip, CLIP_OPTION)
     scale = float(torch.from_numpy(similarity[:3, :3]).double().det().pow(1 / 3))
@@ -100,7 +100,7 @@ def scene_file(
         pose = camera_to_world(cameras[photo.name].view_matrix.double()).tolist()
         size = min(1.0, LONGER_SIDE / max(photo.width, photo.height))
         photos.append(ScenePhoto.of(photo, "train", pose, size))
-    return SceneFile(
+    return SceneRecord(
         photos=photos,
         clip=known.address,
         clip_identity=known.identity,

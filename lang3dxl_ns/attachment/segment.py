@@ -11,13 +11,13 @@ from torch import Tensor
 
 from lang3dxl_ns.common.console import say, tracked
 from lang3dxl_ns.preparation.segmentation import TextSegmenter
-from lang3dxl_ns.query.learn_word import MARK_SIDE
 from lang3dxl_ns.query.scene import Scene
-from lang3dxl_ns.query.teach import Example
 from lang3dxl_ns.rendering import composite
 from lang3dxl_ns.rendering.gathering import Composite, Pixels, gather
 from lang3dxl_ns.scene.camera import Camera, resized
 from lang3dxl_ns.scene.photo import Photo
+from lang3dxl_ns.words.learn_word import MARK_SIDE
+from lang3dxl_ns.words.taught_words import Example
 
 _SIDE = 800
 """Longer side of the photos that are segmented, pixels."""

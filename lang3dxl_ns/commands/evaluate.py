@@ -83,7 +83,7 @@ class EvaluateRun(_Scored):
     """Folder of ground truth (default: the run's setting, or the one beside its data)."""
 
     def main(self) -> None:
-        from lang3dxl_ns.query.run_file import OUTPUTS
+        from lang3dxl_ns.files.runs import OUTPUTS
 
         place = self.run or OUTPUTS
         if place.suffix == ".scene" or (

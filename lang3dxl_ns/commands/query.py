@@ -20,19 +20,19 @@ from lang3dxl_ns.common.console import say, some, tracked
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import make_folder, read_names, slugs, write_atomically
 from lang3dxl_ns.common.settings_help import showing
+from lang3dxl_ns.files.scene_file import Provenance, check_scene_name, replace_scene
+from lang3dxl_ns.files.splat_file import check_splat_name
 from lang3dxl_ns.open_scene import load_scene, provenance_of
 from lang3dxl_ns.query.doubt import doubtful
 from lang3dxl_ns.query.match import save_picture, together
 from lang3dxl_ns.query.question import QueryConfig, Question
-from lang3dxl_ns.query.run_file import read_camera_path
 from lang3dxl_ns.query.scene import Scene
-from lang3dxl_ns.query.scene_file import Provenance, check_scene_name, replace_scene
-from lang3dxl_ns.query.splat_file import check_splat_name
-from lang3dxl_ns.query.teach import run_lengths
 from lang3dxl_ns.query.text import Prompt, caution, listed_phrases, parse_prompts
 from lang3dxl_ns.query.vocabulary import whole_words
-from lang3dxl_ns.query.web.write_page import Page, write_page
 from lang3dxl_ns.scene.camera import Camera
+from lang3dxl_ns.scene.camera_path import read_camera_path
+from lang3dxl_ns.web.write_page import Page, write_page
+from lang3dxl_ns.words.taught_words import run_lengths
 
 _LEAST_PART = 1e-4
 """Share of a photo below which a separate part of a mask is no label."""

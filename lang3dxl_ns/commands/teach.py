@@ -15,7 +15,7 @@ from lang3dxl_ns.common.files import locked
 
 if TYPE_CHECKING:
     from lang3dxl_ns.query.scene import Scene
-    from lang3dxl_ns.query.teach import Example, TaughtWord
+    from lang3dxl_ns.words.taught_words import Example, TaughtWord
 
 
 @dataclass(kw_only=True)
@@ -44,9 +44,9 @@ class Teach:
     """Name or folder of the scene's CLIP, if it is not where the scene file says."""
 
     def main(self) -> None:
+        from lang3dxl_ns.files.scene_file import keep_words
         from lang3dxl_ns.open_scene import existing_scene_file, load_scene
-        from lang3dxl_ns.query.scene_file import keep_words
-        from lang3dxl_ns.query.teach import known_word
+        from lang3dxl_ns.words.taught_words import known_word
 
         file, name = existing_scene_file(self.scene).resolve(), known_word(self.word)
         example = self._example()
@@ -60,7 +60,7 @@ class Teach:
 
     def _example(self) -> Example:
         from lang3dxl_ns.evaluation.layouts import read_gray
-        from lang3dxl_ns.query.teach import Example
+        from lang3dxl_ns.words.taught_words import Example
 
         box = None if self.box is None else _numbers(self.box, 4, "--box LEFT,TOP,RIGHT,BOTTOM")
         points, others = (
@@ -88,9 +88,9 @@ class Words:
     """Name or folder of the scene's CLIP, if it is not where the scene file says."""
 
     def main(self) -> None:
+        from lang3dxl_ns.files.scene_file import describe_scene_file, keep_words
         from lang3dxl_ns.open_scene import existing_scene_file, load_scene
-        from lang3dxl_ns.query.scene_file import describe_scene_file, keep_words
-        from lang3dxl_ns.query.teach import known_word, load_words, save_words
+        from lang3dxl_ns.words.taught_words import known_word, load_words, save_words
 
         if self.save is not None and self.save.suffix != ".json":
             raise UserError(f"--save writes words as JSON: {self.save} is not the name of a .json file")
@@ -128,7 +128,7 @@ class Words:
 
 def forgotten(scene: Scene, which: str) -> Scene:
     """Return the scene without a word (doors) or an example of it (doors/2). Raises UserError without it."""
-    from lang3dxl_ns.query.teach import known_word
+    from lang3dxl_ns.words.taught_words import known_word
 
     name, _, number = which.rpartition("/")
     if known_word(which) in scene.words or not number.isdecimal():

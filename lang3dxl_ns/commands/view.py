@@ -35,8 +35,8 @@ class View:
 
     def main(self) -> None:
         from lang3dxl_ns.open_scene import load_scene, provenance_of
-        from lang3dxl_ns.query.web.serve import PageServer
-        from lang3dxl_ns.query.web.write_page import Page
+        from lang3dxl_ns.web.serve import PageServer
+        from lang3dxl_ns.web.write_page import Page
 
         check_address(self.host, self.port)  # fail now rather than after the work
         scene = load_scene(self.scene, clip=self.clip)
@@ -56,8 +56,8 @@ class Info:
     """A .scene file, or a folder that holds one (default: the newest run under outputs/)."""
 
     def main(self) -> None:
+        from lang3dxl_ns.files.scene_file import describe_scene_file
         from lang3dxl_ns.open_scene import existing_scene_file
-        from lang3dxl_ns.query.scene_file import describe_scene_file
 
         told = describe_scene_file(existing_scene_file(self.scene))
         decoder, count = told["decoder"], told["gaussians"]

@@ -17,13 +17,13 @@ from lang3dxl_ns.evaluation.ground_truth import GroundTruth
 from lang3dxl_ns.evaluation.label_limit import Masks, lifted_labels
 from lang3dxl_ns.evaluation.layouts import Truth
 from lang3dxl_ns.evaluation.scores import LanguageScorer, map_size, overlap
-from lang3dxl_ns.query.places import Box, groups, shared_volume
-from lang3dxl_ns.query.run_file import ScenePhoto
 from lang3dxl_ns.query.scene import Scene
-from lang3dxl_ns.query.teach import known_word
 from lang3dxl_ns.query.text import Prompt
+from lang3dxl_ns.query.view_ranking import Box, groups, shared_volume
 from lang3dxl_ns.scene.camera import Camera
 from lang3dxl_ns.scene.photo import Photo
+from lang3dxl_ns.scene.record import ScenePhoto
+from lang3dxl_ns.words.taught_words import known_word
 
 SceneSplit = Literal["held-out", "seen", "all"]
 _LEAST_SHARE = 0.03

@@ -36,22 +36,22 @@ from lang3dxl_ns.plugin.dataparser import PhotoCollectionDataParserConfig, parse
 from lang3dxl_ns.plugin.inert_settings import OF_IMAGE_CACHES
 from lang3dxl_ns.plugin.nerfstudio_scenes import check_transforms, photos_of, reconstruction_of
 from lang3dxl_ns.plugin.photo_dataset import EvalPhotos, PhotoDataset
-from lang3dxl_ns.preparation.crop_sizes import CropPlan, plan_crops
 from lang3dxl_ns.preparation.encoders import usual_dense
 from lang3dxl_ns.preparation.foreground import foreground_kind, with_foreground
 from lang3dxl_ns.preparation.model_files import CLIP_OPTION, find_model
 from lang3dxl_ns.preparation.needs import Need, needs_table, scene_needs
 from lang3dxl_ns.preparation.photo_cache import PhotoCache, has_vanished
+from lang3dxl_ns.preparation.physical_scale import CropPlan, plan_crops
 from lang3dxl_ns.preparation.prepare import prepare
 from lang3dxl_ns.preparation.regions import RegionSource, region_source
 from lang3dxl_ns.preparation.settings import PreparationConfig
 from lang3dxl_ns.preparation.store import FeatureStore, PhotosGoneError
 from lang3dxl_ns.preparation.targets import CLIP, DENSE, FINE, REGIONS, Batch, SceneFacts, TargetReader
 from lang3dxl_ns.preparation.working_photos import PHOTO_MASKS, PHOTOS, WorkingPhotos
-from lang3dxl_ns.query.run_file import SCENE_FILE, SceneFile, ScenePhoto
 from lang3dxl_ns.scene.camera import LONGEST_SIDE
 from lang3dxl_ns.scene.colmap import Reconstruction
 from lang3dxl_ns.scene.photo import Photo
+from lang3dxl_ns.scene.record import SCENE_FILE, ScenePhoto, SceneRecord
 
 
 @without(*OF_IMAGE_CACHES)
@@ -138,7 +138,7 @@ class Lang3DXLDataManager(FullImageDatamanager):
                     config.dataparser.setup().get_dataparser_outputs("train")
             super().__init__(config, *args, **kwargs)
             if recorded is not None:
-                self._check_recorded(SceneFile.read(recorded.run / SCENE_FILE))
+                self._check_recorded(SceneRecord.read(recorded.run / SCENE_FILE))
         except (UserError, FileNotFoundError) as reason:
             if recorded is None:
                 raise
@@ -147,7 +147,7 @@ class Lang3DXLDataManager(FullImageDatamanager):
             config.longer_side = LONGEST_SIDE  # the recorded cameras have the size of training
             super().__init__(config, *args, **kwargs)
 
-    def _check_recorded(self, scene: SceneFile) -> None:
+    def _check_recorded(self, scene: SceneRecord) -> None:
         """Raise UserError if the photos are no longer those that the run was trained on: nerfstudio would
         find another frame for the cameras, or hold other photos out."""
         outputs = self.train_dataparser_outputs
@@ -261,7 +261,7 @@ class Lang3DXLDataManager(FullImageDatamanager):
             dataset.photos[:] = [photos[photo.name] for photo in dataset.photos]
         return photos
 
-    def scene_file(self, poses: Float[Tensor, "n 3 4"] | None = None) -> SceneFile:
+    def scene_file(self, poses: Float[Tensor, "n 3 4"] | None = None) -> SceneRecord:
         """Describe the scene for the run's folder: photos, cameras and CLIP. `poses`: those of the training
         photos (default: unrefined)."""
         outputs, clip = self.train_dataparser_outputs, self.config.clip
@@ -269,7 +269,7 @@ class Lang3DXLDataManager(FullImageDatamanager):
         trained = self._described(self.train_dataset, "train", poses)
         names = {photo.name for photo in trained}  # with --eval-mode all, the same photos are also held out
         held_out = self._described(self.eval_dataset, "eval")
-        return SceneFile(
+        return SceneRecord(
             photos=[*trained, *(photo for photo in held_out if photo.name not in names)],
             clip=None if known is None else known.address,
             clip_identity=None if known is None else known.identity,

@@ -31,11 +31,11 @@ from lang3dxl_ns.preparation.photo_collection import (
     images_path,
     usable_photos,
 )
-from lang3dxl_ns.query.run_file import SCENE_FILE, SceneFile
 from lang3dxl_ns.scene.colmap import Reconstruction, TrackedPhoto, photos_in_model, read_reconstruction
 from lang3dxl_ns.scene.photo import Photo
 from lang3dxl_ns.scene.photo_folder import extract_frames, find_photos, frames_folder, is_video, photos_below
 from lang3dxl_ns.scene.reconstruct import reconstruct_scene, shows_these
+from lang3dxl_ns.scene.record import SCENE_FILE, SceneRecord
 
 
 @without(*OF_COLMAP)
@@ -253,7 +253,7 @@ class RecordedSceneDataParser(DataParser):
     config: RecordedSceneDataParserConfig
 
     def _generate_dataparser_outputs(self, split: str = "train", **kwargs) -> DataparserOutputs:
-        scene = SceneFile.read(self.config.run / SCENE_FILE)
+        scene = SceneRecord.read(self.config.run / SCENE_FILE)
         chosen = [photo for photo in scene.photos if (photo.split == "train") == (split == "train")]
         chosen = chosen or scene.photos  # with --eval-mode all, no photo is held out
         photos = [photo.photo(Path(scene.data)) for photo in chosen]

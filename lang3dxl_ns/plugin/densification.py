@@ -11,7 +11,7 @@ from gsplat.strategy.ops import remove
 from jaxtyping import Float
 from torch import Tensor
 
-from lang3dxl_ns.components.initialization import near_cameras
+from lang3dxl_ns.training.initialization import near_cameras
 
 _BEYOND = 1.1
 """Factor by which growth may exceed the cap before the least opaque Gaussians are removed."""

@@ -12,13 +12,14 @@ from nerfstudio.data.scene_box import SceneBox
 
 from lang3dxl_ns.common.device import best_device
 from lang3dxl_ns.common.errors import UserError, readable
+from lang3dxl_ns.files.runs import find_config
 from lang3dxl_ns.plugin.model import Lang3DXLModel, Lang3DXLModelConfig
+from lang3dxl_ns.plugin.run_checkpoint import latest_checkpoint
+from lang3dxl_ns.plugin.run_settings import read_model_config
 from lang3dxl_ns.preparation.targets import SceneFacts
 from lang3dxl_ns.query.question import QueryConfig
-from lang3dxl_ns.query.run_checkpoint import latest_checkpoint
-from lang3dxl_ns.query.run_file import SCENE_FILE, SceneFile, find_config
-from lang3dxl_ns.query.run_settings import read_model_config
 from lang3dxl_ns.query.scene import Scene
+from lang3dxl_ns.scene.record import SCENE_FILE, SceneRecord
 
 NOT_FINISHED = "this run has no semantics yet: they are learned when training ends; resume it (--load-dir)"
 
@@ -44,7 +45,7 @@ def load_run(
     """
     place, worker = find_config(run), torch.device(device or best_device())
     settings, checkpoints = read_model_config(place)
-    folder, file = place.parent, SceneFile.read(place.parent / SCENE_FILE)
+    folder, file = place.parent, SceneRecord.read(place.parent / SCENE_FILE)
     path, checkpoint = latest_checkpoint(folder / checkpoints)
     if not isinstance(settings, Lang3DXLModelConfig):
         raise UserError(f"{folder} is a run of another method: train one with ns-train lang3dxl")

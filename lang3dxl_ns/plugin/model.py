@@ -24,7 +24,14 @@ from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.image import fitted_size, resize_nearest
 from lang3dxl_ns.common.reports import part
 from lang3dxl_ns.components import losses
-from lang3dxl_ns.components.initialization import (
+from lang3dxl_ns.evaluation.photo_metrics import Lpips, feature_metrics, match, psnr, reached
+from lang3dxl_ns.plugin.model_config import ModelSettings, make_strategy
+from lang3dxl_ns.plugin.optimizers import semantic_ramp
+from lang3dxl_ns.plugin.optional_components import build_components, component_parameters, match_components
+from lang3dxl_ns.plugin.rendering_model import RenderingModel
+from lang3dxl_ns.plugin.splatfacto import SplatfactoModel
+from lang3dxl_ns.preparation.targets import Batch, foreground
+from lang3dxl_ns.training.initialization import (
     EVERY,
     FREE,
     center_and_radius,
@@ -33,14 +40,7 @@ from lang3dxl_ns.components.initialization import (
     keep_in_bounds,
     seed_positions,
 )
-from lang3dxl_ns.components.learn_codes import TargetView, learn_codes
-from lang3dxl_ns.evaluation.photo_metrics import Lpips, feature_metrics, match, psnr, reached
-from lang3dxl_ns.plugin.model_config import ModelSettings, make_strategy
-from lang3dxl_ns.plugin.optimizers import semantic_ramp
-from lang3dxl_ns.plugin.optional_components import build_components, component_parameters, match_components
-from lang3dxl_ns.plugin.rendering_model import RenderingModel
-from lang3dxl_ns.plugin.splatfacto import SplatfactoModel
-from lang3dxl_ns.preparation.targets import Batch, foreground
+from lang3dxl_ns.training.learn_codes import TargetView, learn_codes
 
 LONGER_SIDE = 1_600
 """Longer side in pixels to which larger photos are reduced for gathering: a CLIP crop covers hundreds of

@@ -17,7 +17,7 @@ from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import check_regular, expanded, read_json
 from lang3dxl_ns.plugin.cameras import lens_of
-from lang3dxl_ns.preparation.crop_sizes import points_in_view
+from lang3dxl_ns.preparation.physical_scale import points_in_view
 from lang3dxl_ns.scene.camera import Lens, check_pose, view_matrix
 from lang3dxl_ns.scene.colmap import Reconstruction, TrackedPhoto
 from lang3dxl_ns.scene.companions import inside

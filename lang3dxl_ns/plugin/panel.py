@@ -17,11 +17,11 @@ from numpy import ndarray as Array
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.worker import Worker
-from lang3dxl_ns.query.conversation import Conversation, plain
+from lang3dxl_ns.plugin.conversation import Conversation, plain
+from lang3dxl_ns.plugin.viewer_guard import Guard, guard_viewers
 from lang3dxl_ns.query.match import Found
-from lang3dxl_ns.query.run_file import overview
-from lang3dxl_ns.query.web.viewer_guard import Guard, guard_viewers
 from lang3dxl_ns.scene.camera import Camera
+from lang3dxl_ns.scene.record import overview
 
 if TYPE_CHECKING:
     from nerfstudio.viewer.viewer import Viewer

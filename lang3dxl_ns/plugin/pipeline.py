@@ -25,7 +25,7 @@ from lang3dxl_ns.plugin.load_scene import model_state
 from lang3dxl_ns.plugin.model import Lang3DXLModel, Lang3DXLModelConfig
 from lang3dxl_ns.plugin.panel import AskPanel
 from lang3dxl_ns.plugin.rendering_model import RenderedAnswers
-from lang3dxl_ns.query.run_file import SCENE_FILE, SceneFile
+from lang3dxl_ns.scene.record import SCENE_FILE, SceneRecord
 
 QUERY_VARIABLE = "LANG3DXL_QUERY"
 
@@ -88,11 +88,11 @@ class Lang3DXLPipeline(VanillaPipeline):
         return os.environ.get(QUERY_VARIABLE) or self.config.query
 
     @cached_property
-    def scene_file(self) -> SceneFile:
+    def scene_file(self) -> SceneRecord:
         """Description of the scene: the photos' names and cameras, and the CLIP."""
         run = self.datamanager.config.run
         if run is not None and (run / SCENE_FILE).is_file():
-            return SceneFile.read(run / SCENE_FILE)
+            return SceneRecord.read(run / SCENE_FILE)
         return self.datamanager.scene_file()
 
     def load_pipeline(self, loaded_state: dict[str, Any], step: int) -> None:

@@ -25,13 +25,12 @@ from lang3dxl_ns.components.downsampler import AttenuatedDownsampler
 from lang3dxl_ns.components.feature_decoder import Decoder
 from lang3dxl_ns.components.sky import Sky
 from lang3dxl_ns.plugin.cameras import to_rasterizer
+from lang3dxl_ns.plugin.conversation import Conversation
 from lang3dxl_ns.plugin.densification import Densification
 from lang3dxl_ns.plugin.model_config import ModelSettings
 from lang3dxl_ns.plugin.splatfacto import SplatfactoModel
 from lang3dxl_ns.preparation.targets import SceneFacts
-from lang3dxl_ns.query.conversation import Conversation
 from lang3dxl_ns.query.question import QueryConfig, Question, pictures
-from lang3dxl_ns.query.run_file import SceneFile
 from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.query.text import EncodeTexts
 from lang3dxl_ns.rendering import Gaussians, Raster, Rendering, Splats, composite, rasterize
@@ -40,6 +39,7 @@ from lang3dxl_ns.rendering.rasterize import Backend, at_fewer_pixels
 from lang3dxl_ns.rendering.spherical_harmonics import spherical_harmonics
 from lang3dxl_ns.rendering.splats import harmonics_of
 from lang3dxl_ns.scene.camera import in_view
+from lang3dxl_ns.scene.record import SceneRecord
 
 DECODE_SIZES = 5
 """Number of sizes at which what Gaussians carry is drawn and decoded in training."""
@@ -118,7 +118,7 @@ class RenderingModel(SplatfactoModel):
     @torch.no_grad()
     def scene(
         self,
-        file: SceneFile,
+        file: SceneRecord,
         *,
         config: QueryConfig | None = None,
         encode_texts: EncodeTexts | None = None,

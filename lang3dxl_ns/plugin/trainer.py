@@ -33,15 +33,15 @@ from lang3dxl_ns.common.files import expanded, replace_durably
 from lang3dxl_ns.common.memory import ran_out_of_memory
 from lang3dxl_ns.common.reports import synchronize
 from lang3dxl_ns.common.stages import Stages, roughly
-from lang3dxl_ns.components.step_guard import StepGuard
+from lang3dxl_ns.files.scene_file import SUFFIX, Provenance, replace_scene
 from lang3dxl_ns.plugin.optimizers import GuardedOptimizers, add_rows_to_state
 from lang3dxl_ns.plugin.pipeline import Lang3DXLPipeline
+from lang3dxl_ns.plugin.run_checkpoint import NOT_A_CHECKPOINT, check_checkpoint, read_checkpoint
 from lang3dxl_ns.plugin.sizes import plan
 from lang3dxl_ns.preparation.needs import NEEDS_FILE, write_needs
 from lang3dxl_ns.preparation.store import PhotosGoneError
-from lang3dxl_ns.query.run_checkpoint import NOT_A_CHECKPOINT, check_checkpoint, read_checkpoint
-from lang3dxl_ns.query.run_file import SCENE_FILE, SceneFile
-from lang3dxl_ns.query.scene_file import SUFFIX, Provenance, replace_scene
+from lang3dxl_ns.scene.record import SCENE_FILE, SceneRecord
+from lang3dxl_ns.training.step_guard import StepGuard
 
 RENDERINGS_PER_STEP = {False: 3.0, True: 4.0}
 """Duration of an iteration in renderings of its photo, by whether semantics are trained with the scene: 1.5
@@ -184,7 +184,7 @@ class Lang3DXLTrainer(Trainer):
         state = read_checkpoint(path)
         if (before := path.parent.with_name(SCENE_FILE)).is_file():
             corrected = any(name.endswith("pose_adjustment") for name in state["pipeline"])
-            self._check_photos(path, SceneFile.read(before), corrected)
+            self._check_photos(path, SceneRecord.read(before), corrected)
         try:
             self._start_step = state["step"] + 1
             self.pipeline.load_pipeline(state["pipeline"], state["step"])
@@ -206,7 +206,7 @@ class Lang3DXLTrainer(Trainer):
             ) from error
         CONSOLE.log(f"Loaded {path}")
 
-    def _check_photos(self, path: Path, before: SceneFile, corrected: bool) -> None:
+    def _check_photos(self, path: Path, before: SceneRecord, corrected: bool) -> None:
         """Check that a checkpoint's photos are this run's. Raises UserError for another frame, and, if the
         cameras were `corrected` one by one, for other training photos."""
         data = self.pipeline.datamanager

@@ -20,19 +20,20 @@ from lang3dxl_ns.common.files import expanded
 from lang3dxl_ns.common.reports import synchronize
 from lang3dxl_ns.common.settings_help import showing
 from lang3dxl_ns.common.stages import roughly
+from lang3dxl_ns.files.runs import find_config
 from lang3dxl_ns.plugin.dataparser import PhotoCollectionDataParserConfig
 from lang3dxl_ns.plugin.inert_settings import check_inert
 from lang3dxl_ns.plugin.optimizers import RunAdamConfig, RunScheduleConfig
 from lang3dxl_ns.plugin.pipeline import Lang3DXLPipeline, Lang3DXLPipelineConfig, print_user_errors_plainly
+from lang3dxl_ns.plugin.run_checkpoint import check_checkpoint, latest_checkpoint
+from lang3dxl_ns.plugin.run_settings import load_configs, no_config, read_settings
 from lang3dxl_ns.plugin.trainer import RENDERINGS_PER_STEP, Lang3DXLTrainer, requested_checkpoint
 from lang3dxl_ns.preparation.model_files import BUILTIN, check_encoders
 from lang3dxl_ns.preparation.needs import read_needs
-from lang3dxl_ns.query.run_checkpoint import check_checkpoint, latest_checkpoint
-from lang3dxl_ns.query.run_file import SCENE_FILE, find_config
-from lang3dxl_ns.query.run_settings import load_configs, no_config, read_settings
 from lang3dxl_ns.rendering import Gaussians, gsplat_build, rasterize
 from lang3dxl_ns.scene.camera import Camera
 from lang3dxl_ns.scene.photo_folder import check_data
+from lang3dxl_ns.scene.record import SCENE_FILE
 
 LONG_RUN_S = 3_600.0
 """Seconds of training on a slow GPU rasterizer above which a run is refused."""

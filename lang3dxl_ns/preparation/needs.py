@@ -15,7 +15,7 @@ from numpy import ndarray as Array
 from lang3dxl_ns.common.errors import readable
 from lang3dxl_ns.common.files import read_json
 from lang3dxl_ns.common.reports import markdown_table, write_report
-from lang3dxl_ns.preparation.crop_sizes import SCALE_RATIO, CropPlan, crop_sides
+from lang3dxl_ns.preparation.physical_scale import SCALE_RATIO, CropPlan, crop_sides
 from lang3dxl_ns.scene.colmap import Reconstruction
 from lang3dxl_ns.scene.photo import Photo
 from lang3dxl_ns.scene.photometry import measure_photometry

@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from lang3dxl_ns.common.memory import with_less_memory
-from lang3dxl_ns.preparation.crop_sizes import SMALLEST_CROP, crop_sides, fine_crops
+from lang3dxl_ns.preparation.physical_scale import SMALLEST_CROP, crop_sides, fine_crops
 from lang3dxl_ns.preparation.settings import Quality
 
 

@@ -18,8 +18,8 @@ from torch import Tensor
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import expanded, write_atomically
 from lang3dxl_ns.query.heat_maps import overlay, tinted, with_legend
-from lang3dxl_ns.query.places import Box, Viewpoint
 from lang3dxl_ns.query.text import Prompt
+from lang3dxl_ns.query.view_ranking import Box, Viewpoint
 from lang3dxl_ns.rendering import Rendering
 from lang3dxl_ns.scene.camera import Camera
 

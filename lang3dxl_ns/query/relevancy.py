@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lang3dxl_ns.common.memory import with_less_memory
-from lang3dxl_ns.query.teach import TaughtWord
+from lang3dxl_ns.words.taught_words import TaughtWord
 
 CANONICAL = ("object", "things", "stuff", "texture")
 """Phrases that match anything (LERF). A prompt wins where its cosine exceeds those of all of them."""

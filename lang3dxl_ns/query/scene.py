@@ -22,17 +22,13 @@ from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import expanded
 from lang3dxl_ns.components.appearance import AppearanceField, Look, render_in_look
 from lang3dxl_ns.components.feature_decoder import Decoder
+from lang3dxl_ns.files.splat_file import write_index, write_splats
 from lang3dxl_ns.preparation.encoders import load_image_text_encoder
 from lang3dxl_ns.query.doubt import DOUBTFUL, Doubts, doubtful
 from lang3dxl_ns.query.engine import QueryEngine, make_engine
-from lang3dxl_ns.query.learn_word import Weights, learn
 from lang3dxl_ns.query.match import Found, Match, View
-from lang3dxl_ns.query.places import Viewpoint, rank_views, strongest_match
 from lang3dxl_ns.query.question import QueryConfig, Question, match_thresholds
 from lang3dxl_ns.query.relevancy import Queries
-from lang3dxl_ns.query.run_file import SceneFile, ScenePhoto, overview
-from lang3dxl_ns.query.splat_file import write_index, write_splats
-from lang3dxl_ns.query.teach import Example, TaughtWord, known_word
 from lang3dxl_ns.query.text import (
     EncodeTexts,
     Prompt,
@@ -42,11 +38,15 @@ from lang3dxl_ns.query.text import (
     taught_prompt,
     texts_of,
 )
+from lang3dxl_ns.query.view_ranking import Viewpoint, rank_views, strongest_match
 from lang3dxl_ns.query.visibility import VisibleGaussians, fingerprint, load_visible, save_visible, spread
 from lang3dxl_ns.query.vocabulary import CLEAR, NOTHING, searched, shipped_vocabulary
 from lang3dxl_ns.rendering import Backend, Rendering, Splats, composite
 from lang3dxl_ns.rendering.gathering import filled_pixels
 from lang3dxl_ns.scene.camera import Camera, posed, resized, with_field_of_view, with_longer_side
+from lang3dxl_ns.scene.record import ScenePhoto, SceneRecord, overview
+from lang3dxl_ns.words.learn_word import Weights, learn
+from lang3dxl_ns.words.taught_words import Example, TaughtWord, known_word
 
 _ROWS = 65_536
 """Number of Gaussians decoded at a time."""
@@ -69,7 +69,7 @@ class Scene:
 
     splats: Splats
     """The Gaussians, in the model's frame."""
-    file: SceneFile
+    file: SceneRecord
     """Photos, cameras, and the CLIP that the features come from."""
     decoder: Decoder | None = None
     """Turns codes into features; None for a scene with colors only."""
@@ -651,7 +651,7 @@ class Scene:
         return Doubts(self.engine.of_gaussians, lambda texts: self.text.plain_queries(texts).to(self.device))
 
 
-def text_encoder(file: SceneFile, device: torch.device | str) -> EncodeTexts:
+def text_encoder(file: SceneRecord, device: torch.device | str) -> EncodeTexts:
     """Load the CLIP that a scene's features come from. Raises UserError if it is missing or has changed."""
     if file.clip is None:
         raise UserError(NO_SEMANTICS)

@@ -18,8 +18,8 @@ from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.query.doubt import UNRELATED
 from lang3dxl_ns.query.relevancy import Queries
-from lang3dxl_ns.query.teach import TaughtWord, known_word
 from lang3dxl_ns.query.vocabulary import NEGATIVES, competitors, searched, synonyms_of
+from lang3dxl_ns.words.taught_words import TaughtWord, known_word
 
 EncodeTexts = Callable[[list[str]], Float[Tensor, "n c"]]
 """Function that encodes texts, such as `ImageTextEncoder.encode_texts`."""

@@ -13,7 +13,7 @@ from lang3dxl_ns.common.presets import load_preset
 from lang3dxl_ns.preparation.encoders import CLIP_OPTION, find_model
 from lang3dxl_ns.query.doubt import UNRELATED
 from lang3dxl_ns.query.relevancy import CANONICAL
-from lang3dxl_ns.query.teach import known_word
+from lang3dxl_ns.words.taught_words import known_word
 
 _SURROUNDINGS: dict[str, tuple[str, ...]] = {
     "sky": ("cloud",),

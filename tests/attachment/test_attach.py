@@ -17,12 +17,12 @@ from lang3dxl_ns.attachment.learn import prepare_photos, settled
 from lang3dxl_ns.commands.attach import Attach, _show
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.components.compression import CompressionConfig
+from lang3dxl_ns.files.read_splats import read_splats
+from lang3dxl_ns.files.scene_file import read_scene
+from lang3dxl_ns.files.scene_file import write_scene as write_scene_file
+from lang3dxl_ns.files.splat_file import write_splats
 from lang3dxl_ns.preparation.photo_collection import read_collection
-from lang3dxl_ns.query.read_splats import read_splats
-from lang3dxl_ns.query.scene_file import read_scene
-from lang3dxl_ns.query.scene_file import write_scene as write_scene_file
-from lang3dxl_ns.query.splat_file import write_splats
-from lang3dxl_ns.query.teach import Example
+from lang3dxl_ns.words.taught_words import Example
 
 SETTINGS = AttachConfig(views=6, up="z", clip="builtin", dense="builtin", dense_tokens=16)
 

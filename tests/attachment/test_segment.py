@@ -9,10 +9,10 @@ from painted_scene import painted_scene
 
 from lang3dxl_ns.attachment.segment import _share as share_of
 from lang3dxl_ns.attachment.segment import segmented
-from lang3dxl_ns.query.learn_word import MARK_SIDE
 from lang3dxl_ns.query.match import save_picture
 from lang3dxl_ns.scene.camera import resized
 from lang3dxl_ns.scene.photo import Photo
+from lang3dxl_ns.words.learn_word import MARK_SIDE
 
 DOME = 1 / 3
 """Brightness of the dome in photos."""

@@ -16,9 +16,9 @@ from lang3dxl_ns.cli import main
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.methods import lang3dxl
 from lang3dxl_ns.open_scene import load_scene
+from lang3dxl_ns.plugin.run_checkpoint import read_checkpoint
+from lang3dxl_ns.plugin.run_settings import TRUST_VARIABLE, check_command_line
 from lang3dxl_ns.plugin.trainer_config import open_run, read_config
-from lang3dxl_ns.query.run_checkpoint import read_checkpoint
-from lang3dxl_ns.query.run_settings import TRUST_VARIABLE, check_command_line
 
 TRAPS = [
     "!!python/object/apply:os.system ['touch {trap}']",

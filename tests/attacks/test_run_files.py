@@ -9,8 +9,9 @@ import pytest
 from lab.landmark.novel_views import read_novel_views
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.preparation.needs import NEEDS_FILE, read_needs
-from lang3dxl_ns.query.run_file import SceneFile, ScenePhoto, read_camera_path
 from lang3dxl_ns.scene.camera import Lens
+from lang3dxl_ns.scene.camera_path import read_camera_path
+from lang3dxl_ns.scene.record import ScenePhoto, SceneRecord
 
 POSE = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 2.0]]
 
@@ -20,9 +21,9 @@ def scene_file(folder, change):
         ScenePhoto(f"photo_{i}.jpg", "train", POSE, Lens(40, 30, 50.0, 51.0, 20.0, 15.0)) for i in range(2)
     ]
     path = folder / "scene.json"
-    SceneFile(photos, "clip", "identity", 1.0, POSE, "data").write(path)
+    SceneRecord(photos, "clip", "identity", 1.0, POSE, "data").write(path)
     content = json.loads(path.read_text())
-    SceneFile.read(path)
+    SceneRecord.read(path)
     change(content)
     path.write_text(json.dumps(content))
     return path
@@ -81,7 +82,7 @@ def set_of_lens(name, value):
 def test_a_scene_file_with_something_of_another_kind_is_named(tmp_path, change):
     path = scene_file(tmp_path, change)
     with pytest.raises(UserError, match=r"scene\.json can't be read"):
-        SceneFile.read(path)
+        SceneRecord.read(path)
 
 
 @pytest.mark.parametrize(
@@ -91,7 +92,7 @@ def test_a_scene_file_with_something_of_another_kind_is_named(tmp_path, change):
 def test_a_scene_file_that_is_none_is_named(tmp_path, text):
     (tmp_path / "scene.json").write_text(text)
     with pytest.raises(UserError, match=r"scene\.json can't be read"):
-        SceneFile.read(tmp_path / "scene.json")
+        SceneRecord.read(tmp_path / "scene.json")
 
 
 @pytest.mark.parametrize("text", ["[" * 100_000, "", "[1]", '{"a": 1}', '{"a": {}}', "\xff"])
@@ -163,7 +164,7 @@ def test_a_camera_path_that_nothing_can_be_rendered_from_is_named(tmp_path, chan
 def test_poses_written_as_integers_are_poses(tmp_path):
     whole = [[int(value) for value in row] for row in POSE]
     path = scene_file(tmp_path, set_of_photo("camera_to_world", whole))
-    assert SceneFile.read(path).photos[1].camera.view_matrix.is_floating_point()
+    assert SceneRecord.read(path).photos[1].camera.view_matrix.is_floating_point()
 
 
 @pytest.mark.parametrize("content", [None, "", "{}", '{"render_width": 1, "camera_path": [{}]}'])
@@ -174,7 +175,7 @@ def test_a_camera_path_that_is_none_is_named(tmp_path, content):
         read_camera_path(tmp_path / "path.json")
 
 
-@pytest.mark.parametrize("read", [SceneFile.read, read_camera_path])
+@pytest.mark.parametrize("read", [SceneRecord.read, read_camera_path])
 def test_pipes_are_refused_instead_of_waited_for(tmp_path, read):
     os.mkfifo(tmp_path / "file.json")
     with pytest.raises(UserError, match=r"file\.json"):

@@ -20,11 +20,11 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.query.web import serve
-from lang3dxl_ns.query.web.access import Access
-from lang3dxl_ns.query.web.serve import PageServer
-from lang3dxl_ns.query.web.viewer_guard import RENDER_NAME, Guard, file_name, guard_viewers
-from lang3dxl_ns.query.web.write_page import Page
+from lang3dxl_ns.plugin.viewer_guard import RENDER_NAME, Guard, file_name, guard_viewers
+from lang3dxl_ns.web import serve
+from lang3dxl_ns.web.access import Access
+from lang3dxl_ns.web.serve import PageServer
+from lang3dxl_ns.web.write_page import Page
 
 CAMERA = {
     "type": "ViewerCameraMessage",

@@ -18,8 +18,7 @@ from lang3dxl_ns.cli import main
 from lang3dxl_ns.commands.query import CocoLabels, Export
 from lang3dxl_ns.commands.teach import Teach, forgotten
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.open_scene import find_scene_file
-from lang3dxl_ns.query.scene_file import (
+from lang3dxl_ns.files.scene_file import (
     Provenance,
     describe_scene_file,
     keep_words,
@@ -27,7 +26,8 @@ from lang3dxl_ns.query.scene_file import (
     replace_scene,
     write_scene,
 )
-from lang3dxl_ns.query.teach import Example, load_words, mask_of, run_lengths
+from lang3dxl_ns.open_scene import find_scene_file
+from lang3dxl_ns.words.taught_words import Example, load_words, mask_of, run_lengths
 
 DOME = "61,61,77,77"
 """Box of the dome in all/0003.jpg, a little large."""
@@ -98,7 +98,7 @@ def test_a_word_that_is_taught_while_another_is_forgotten_stays(place, monkeypat
 
 def test_a_word_that_is_taught_twice_at_once_has_both_examples(place, monkeypatch):
     monkeypatch.setattr(
-        "lang3dxl_ns.query.scene_file.keep_words", lambda *given: time.sleep(0.5) or keep_words(*given)
+        "lang3dxl_ns.files.scene_file.keep_words", lambda *given: time.sleep(0.5) or keep_words(*given)
     )
     two = [Teach(scene=place, word="gizmo", photo="0003.jpg", at=[at]) for at in ("69,69", "70,70")]
     with ThreadPoolExecutor() as both:
@@ -245,7 +245,7 @@ def test_a_word_that_is_taught_while_its_scene_is_written_over_stays(place, tmp_
         taught.wait(1.5)  # in vain, since the other command waits for this one
         return write_scene(*given)
 
-    monkeypatch.setattr("lang3dxl_ns.query.scene_file.write_scene", slowly)
+    monkeypatch.setattr("lang3dxl_ns.files.scene_file.write_scene", slowly)
     with ThreadPoolExecutor() as both:
         writing = both.submit(export.main)
         begun.wait()

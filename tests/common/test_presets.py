@@ -5,7 +5,7 @@ import pytest
 from lang3dxl_ns import cli
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.presets import FOLDER, load_preset, scene_presets, train_flags
-from lang3dxl_ns.preparation.crop_sizes import physical_scales
+from lang3dxl_ns.preparation.physical_scale import physical_scales
 
 
 def test_every_scene_has_a_range_that_makes_the_published_number_of_scales():

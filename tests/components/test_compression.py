@@ -18,9 +18,9 @@ from lang3dxl_ns.components.compression import (
     fit,
 )
 from lang3dxl_ns.components.feature_decoder import Gathered
-from lang3dxl_ns.components.learn_codes import TargetView, learn_codes
 from lang3dxl_ns.components.principal_basis import PrincipalBasis
 from lang3dxl_ns.components.semantic_field import SemanticField, SemanticFieldConfig
+from lang3dxl_ns.training.learn_codes import TargetView, learn_codes
 
 CHANNELS = 24
 QUICK = CompressionConfig(steps=150, batch=512)

@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from lang3dxl_ns.components import learn_codes
-from lang3dxl_ns.components.learn_codes import sharpen
+from lang3dxl_ns.training import learn_codes
+from lang3dxl_ns.training.learn_codes import sharpen
 
 
 def scene(count=3000, seed=0, kinds=4):

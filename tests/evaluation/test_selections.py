@@ -12,11 +12,11 @@ from PIL import Image
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth
 from lang3dxl_ns.evaluation.score_scene import box_iou, score_scene, score_selections
-from lang3dxl_ns.query.places import Box
-from lang3dxl_ns.query.run_file import ScenePhoto
-from lang3dxl_ns.query.teach import Example
+from lang3dxl_ns.query.view_ranking import Box
 from lang3dxl_ns.scene.camera import Lens
 from lang3dxl_ns.scene.photo import Photo
+from lang3dxl_ns.scene.record import ScenePhoto
+from lang3dxl_ns.words.taught_words import Example
 
 NAMES = ("dome", "window")
 

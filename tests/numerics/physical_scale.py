@@ -13,7 +13,7 @@ from numpy import ndarray as Array
 
 from lab.numerics.measure import Bounds, Case, Problem
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.preparation.crop_sizes import (
+from lang3dxl_ns.preparation.physical_scale import (
     crop_sides,
     physical_scales,
     pixel_size,

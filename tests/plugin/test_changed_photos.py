@@ -12,14 +12,14 @@ from conftest import make_trainer
 from scenes import write_scene
 
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.files.scene_file import describe_scene_file, read_scene
+from lang3dxl_ns.files.scene_file import write_scene as write_scene_file
 from lang3dxl_ns.methods import lang3dxl
 from lang3dxl_ns.open_scene import train as train_scene
 from lang3dxl_ns.plugin.trainer import Lang3DXLTrainer
 from lang3dxl_ns.plugin.trainer_config import open_run, read_config
-from lang3dxl_ns.query.run_file import SCENE_FILE, SceneFile
-from lang3dxl_ns.query.scene_file import describe_scene_file, read_scene
-from lang3dxl_ns.query.scene_file import write_scene as write_scene_file
-from lang3dxl_ns.query.teach import TaughtWord
+from lang3dxl_ns.scene.record import SCENE_FILE, SceneRecord
+from lang3dxl_ns.words.taught_words import TaughtWord
 
 PARSER = "pipeline__datamanager__dataparser__"
 
@@ -34,7 +34,7 @@ def test_a_frame_that_is_meters_away_on_a_map_is_another_one():
     """Its shift is small beside coordinates of millions of meters."""
     pose = [[1.0, 0, 0, -5e5], [0, 1.0, 0, -5.4e6], [0, 0, 1.0, 0]]
     moved = [[1.0, 0, 0, -5e5], [0, 1.0, 0, -5.4e6 - 100], [0, 0, 1.0, 0]]
-    file = SceneFile([], None, None, 0.01, pose, "data")
+    file = SceneRecord([], None, None, 0.01, pose, "data")
     assert file.has_frame(pose, 0.01) and not file.has_frame(moved, 0.01)
 
 
@@ -81,7 +81,7 @@ def test_scenes_and_runs_record_the_cameras_that_training_refined(train, tmp_pat
         model.camera_optimizer.pose_adjustment[:] = 0.1 * torch.rand(3, 6)
     trainer.write_scene()
     recorded = [
-        SceneFile.read(trainer.base_dir / SCENE_FILE),
+        SceneRecord.read(trainer.base_dir / SCENE_FILE),
         read_scene(trainer.base_dir / "scene.scene").file,
     ]
     for camera, batch in photos:

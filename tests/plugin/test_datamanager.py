@@ -10,7 +10,6 @@ import torch
 from PIL import Image, ImageOps
 
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.components.initialization import sphere_around
 from lang3dxl_ns.plugin.datamanager import Lang3DXLDataManager
 from lang3dxl_ns.plugin.dataparser import PhotoCollectionDataParserConfig
 from lang3dxl_ns.plugin.photo_dataset import PhotoDataset
@@ -19,6 +18,7 @@ from lang3dxl_ns.preparation.photo_cache import PhotoCache
 from lang3dxl_ns.preparation.store import FeatureStore
 from lang3dxl_ns.preparation.working_photos import WorkingPhotos
 from lang3dxl_ns.scene.camera import view_matrix
+from lang3dxl_ns.training.initialization import sphere_around
 
 
 def photo(index: int) -> dict[str, torch.Tensor]:

@@ -17,11 +17,11 @@ from tiny_models import make_tiny_clip
 import lang3dxl_ns
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.evaluation.scores import open_scorer
+from lang3dxl_ns.files.scene_file import describe_scene_file, keep_words, read_scene
 from lang3dxl_ns.query.relevancy import TEMPERATURE
-from lang3dxl_ns.query.run_file import SCENE_FILE, SceneFile
-from lang3dxl_ns.query.scene_file import describe_scene_file, keep_words, read_scene
-from lang3dxl_ns.query.teach import Example
 from lang3dxl_ns.rendering import Gaussians, rasterize, spherical_harmonics
+from lang3dxl_ns.scene.record import SCENE_FILE, SceneRecord
+from lang3dxl_ns.words.taught_words import Example
 
 WHOLE_SKY = {"pipeline__model__sky_gaussians": 2_000}
 """Through gaps in a smaller one faint Gaussians show, which rounding draws or leaves out."""
@@ -163,7 +163,7 @@ def test_a_folder_that_moved_can_be_asked(trainer, tmp_path):
 
 def test_a_model_in_training_can_be_asked(trainer):
     model = trainer.pipeline.model.eval()
-    scene = model.scene(SceneFile.read(trainer.base_dir / SCENE_FILE))
+    scene = model.scene(SceneRecord.read(trainer.base_dir / SCENE_FILE))
     before = scene.query("dome", "photo_000").relevancy
     assert np.isfinite(before).all()
     means = model.means.detach().clone()
@@ -187,15 +187,15 @@ def test_mistakes_are_reported(config, tmp_path):
 
 
 def test_a_run_without_semantics_is_refused(trainer):
-    file = SceneFile.read(trainer.base_dir / SCENE_FILE)
+    file = SceneRecord.read(trainer.base_dir / SCENE_FILE)
     with pytest.raises(UserError, match="colors alone"):
-        trainer.pipeline.model.scene(SceneFile(**{**vars(file), "clip": None})).query("dome")
+        trainer.pipeline.model.scene(SceneRecord(**{**vars(file), "clip": None})).query("dome")
 
 
 def test_another_clip_is_refused(trainer):
-    file = SceneFile.read(trainer.base_dir / SCENE_FILE)
+    file = SceneRecord.read(trainer.base_dir / SCENE_FILE)
     with pytest.raises(UserError, match="not the one that this scene was made with"):
-        trainer.pipeline.model.scene(SceneFile(**{**vars(file), "clip_identity": "another"})).query("dome")
+        trainer.pipeline.model.scene(SceneRecord(**{**vars(file), "clip_identity": "another"})).query("dome")
 
 
 def test_a_run_remembers_its_foreground_masks(trainer, scene):

@@ -12,7 +12,7 @@ from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.open_scene import load_scene
 from lang3dxl_ns.plugin.pipeline import Lang3DXLPipeline
 from lang3dxl_ns.plugin.trainer import Lang3DXLTrainer
-from lang3dxl_ns.query.run_file import SCENE_FILE, SceneFile
+from lang3dxl_ns.scene.record import SCENE_FILE, SceneRecord
 
 EVERYTHING = {
     "pipeline__model__decoder__name": "paper",
@@ -86,7 +86,7 @@ def test_a_run_of_another_scene_is_not_resumed(train, scene, whole, tmp_path):
     """Its Gaussians are in other coordinates."""
     (folder := tmp_path / "run" / "nerfstudio_models").mkdir(parents=True)
     shutil.copy(whole.checkpoint_dir / "step-000000010.ckpt", folder)
-    told = SceneFile.read(whole.base_dir / SCENE_FILE)
+    told = SceneRecord.read(whole.base_dir / SCENE_FILE)
     replace(told, scale=1.1 * told.scale).write(folder.with_name(SCENE_FILE))
     with pytest.raises(UserError, match="is of other photos, or of another reconstruction of them"):
         train(scene, iterations=20, load_dir=folder, **EVERYTHING)

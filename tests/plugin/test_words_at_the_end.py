@@ -132,7 +132,7 @@ def test_the_time_announced_includes_the_words(trained, monkeypatch):
     run, _ = trained
     said: list[str] = []
     monkeypatch.setattr("lang3dxl_ns.plugin.trainer.CONSOLE.log", lambda text, **_: said.append(str(text)))
-    monkeypatch.setattr("lang3dxl_ns.components.learn_codes.say", said.append)
+    monkeypatch.setattr("lang3dxl_ns.training.learn_codes.say", said.append)
     run()
     (line,) = (line for line in said if line.startswith("training: "))
     assert "to learn words" in line

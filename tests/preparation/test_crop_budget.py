@@ -4,8 +4,8 @@ import math
 
 import pytest
 
-from lang3dxl_ns.preparation.crop_sizes import crop_sides, fine_crops
 from lang3dxl_ns.preparation.model_files import BUILTIN, CLIP_OPTION, find_model, read_config
+from lang3dxl_ns.preparation.physical_scale import crop_sides, fine_crops
 from lang3dxl_ns.preparation.pyramid import HALF, MOST_CROPS, THIRD, choose_crops, crop_centers
 
 PACKAGED_CLIP = find_model(BUILTIN, CLIP_OPTION)

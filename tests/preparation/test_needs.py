@@ -12,8 +12,8 @@ from PIL import Image
 from lab.landmark.scene_writer import DemoScene, write_scene
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.plugin.dataparser import PhotoCollectionDataParserConfig
-from lang3dxl_ns.preparation.crop_sizes import plan_crops
 from lang3dxl_ns.preparation.needs import needs_table, read_needs, scene_needs, write_needs
+from lang3dxl_ns.preparation.physical_scale import plan_crops
 from lang3dxl_ns.preparation.settings import PreparationConfig
 from lang3dxl_ns.scene.photometry import measure_photometry
 

@@ -9,7 +9,7 @@ import pytest
 from scenes import write_scene
 
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.preparation.crop_sizes import (
+from lang3dxl_ns.preparation.physical_scale import (
     crop_sides,
     physical_scales,
     pixel_size,

@@ -4,7 +4,7 @@ import pytest
 import torch
 from sklearn.cluster import DBSCAN
 
-from lang3dxl_ns.query.places import strongest_match
+from lang3dxl_ns.query.view_ranking import strongest_match
 
 
 def clouds(*places: float, count: int = 500) -> torch.Tensor:

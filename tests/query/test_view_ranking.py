@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from lang3dxl_ns.query.places import rank_views
+from lang3dxl_ns.query.view_ranking import rank_views
 from lang3dxl_ns.query.visibility import VisibleGaussians
 from lang3dxl_ns.scene.camera import Camera
 

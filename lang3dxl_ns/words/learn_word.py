@@ -23,11 +23,11 @@ from torch import Tensor
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.query.engine import QueryEngine
 from lang3dxl_ns.query.relevancy import Queries
-from lang3dxl_ns.query.run_file import ScenePhoto
-from lang3dxl_ns.query.teach import MASK_SIDE, Example, TaughtWord
 from lang3dxl_ns.rendering import Backend, Splats, composite
 from lang3dxl_ns.rendering.gathering import filled_parts
 from lang3dxl_ns.scene.camera import resized
+from lang3dxl_ns.scene.record import ScenePhoto
+from lang3dxl_ns.words.taught_words import MASK_SIDE, Example, TaughtWord
 
 MARK_SIDE = 320
 """Longer side in pixels of the views in which marks are gathered."""

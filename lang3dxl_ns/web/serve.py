@@ -12,8 +12,8 @@ from socketserver import TCPServer
 from urllib.parse import parse_qsl, urlsplit
 
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.query.web.access import Access
-from lang3dxl_ns.query.web.write_page import Page
+from lang3dxl_ns.web.access import Access
+from lang3dxl_ns.web.write_page import Page
 
 FIRST_PORT, PORTS = 7007, 20
 """First port, and number of ports, that are tried if none is requested."""

@@ -34,15 +34,15 @@ from lang3dxl_ns.components.appearance import AppearanceConfig, AppearanceField
 from lang3dxl_ns.components.decoders import DecoderConfig, make_decoder
 from lang3dxl_ns.components.feature_decoder import Decoder
 from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
+from lang3dxl_ns.files.splat_file import log_scales, logits
 from lang3dxl_ns.query.question import QueryConfig
-from lang3dxl_ns.query.run_file import SceneFile, scene_from_json
 from lang3dxl_ns.query.scene import Scene
-from lang3dxl_ns.query.splat_file import log_scales, logits
-from lang3dxl_ns.query.teach import TaughtWord, known_word, save_words
 from lang3dxl_ns.query.text import EncodeTexts
 from lang3dxl_ns.query.vocabulary import common_words
 from lang3dxl_ns.rendering import Splats
 from lang3dxl_ns.scene.camera import MOST_PIXELS, resized
+from lang3dxl_ns.scene.record import SceneRecord, scene_from_json
+from lang3dxl_ns.words.taught_words import TaughtWord, known_word, save_words
 
 Module = TypeVar("Module", bound=torch.nn.Module)
 SUFFIX = ".scene"
@@ -276,7 +276,7 @@ class _File:
         self.about: dict[str, Any] = json.loads((opened.metadata() or {})[_KEY])
         if self.about["version"] != VERSION:
             raise _NewerError(self.about["version"])
-        self.scene: SceneFile = scene_from_json(self.about["scene"])
+        self.scene: SceneRecord = scene_from_json(self.about["scene"])
         self.provenance = Provenance(**self.about["provenance"])
         expect(all(isinstance(t, str) for t in vars(self.provenance).values()), "its origin is no text")
         self.background: list[float] | None = self.about["background"]

@@ -27,11 +27,11 @@ from lang3dxl_ns.commands.view import Info
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.components.decoders import DecoderConfig, make_decoder
 from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
+from lang3dxl_ns.files.scene_file import Provenance, describe_scene_file, read_scene, write_scene
+from lang3dxl_ns.files.splat_file import write_splats
 from lang3dxl_ns.query.relevancy import TEMPERATURE
 from lang3dxl_ns.query.scene import Scene
-from lang3dxl_ns.query.scene_file import Provenance, describe_scene_file, read_scene, write_scene
-from lang3dxl_ns.query.splat_file import write_splats
-from lang3dxl_ns.query.teach import Example
+from lang3dxl_ns.words.taught_words import Example
 
 ATOL = 1e-4 * TEMPERATURE
 """Of relevancies, whose slope is a quarter of the temperature: files hold half the digits."""

@@ -27,13 +27,13 @@ from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import read_names
 from lang3dxl_ns.components.compression import CompressedField
 from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
+from lang3dxl_ns.files.scene_file import Provenance
 from lang3dxl_ns.query.doubt import LEAST_PEAK, peaks
 from lang3dxl_ns.query.question import QueryConfig
 from lang3dxl_ns.query.scene import NO_SEMANTICS
-from lang3dxl_ns.query.scene_file import Provenance
-from lang3dxl_ns.query.teach import TaughtWord
 from lang3dxl_ns.query.vocabulary import common_words, shipped_vocabulary, whole_words
-from lang3dxl_ns.query.web.write_page import Page, write_page
+from lang3dxl_ns.web.write_page import Page, write_page
+from lang3dxl_ns.words.taught_words import TaughtWord
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 SWITCHES = [
@@ -636,7 +636,7 @@ def test_a_page_whose_writing_was_stopped_is_written_again(scene, tmp_path, monk
         path.write_bytes(content)
 
     with monkeypatch.context() as patched:
-        patched.setattr("lang3dxl_ns.query.web.write_page.write_atomically", stop)
+        patched.setattr("lang3dxl_ns.web.write_page.write_atomically", stop)
         with pytest.raises(KeyboardInterrupt):
             write_page(Page(scene), tmp_path)
     assert write_page(Page(scene), tmp_path) == sum(path.stat().st_size for path in tmp_path.iterdir())
@@ -669,7 +669,7 @@ def test_all_views_are_in_a_page_and_what_is_left_out_is_told(monkeypatch, scene
     files = page.files()
     names = [view["name"] for view in json.loads(files["scene.json"])["views"]]
     assert names == list(scene.visible) and page.left_out == []
-    monkeypatch.setattr("lang3dxl_ns.query.web.write_page._MOST_BYTES", len(files["views.bin"]) - 1)
+    monkeypatch.setattr("lang3dxl_ns.web.write_page._MOST_BYTES", len(files["views.bin"]) - 1)
     smaller = page.files()
     about = json.loads(smaller["scene.json"])
     assert 0 < len(about["views"]) < len(names) and len(smaller["views.bin"]) < len(files["views.bin"])
@@ -686,7 +686,7 @@ def test_lightings_are_files_of_a_page_or_answers_of_a_server(monkeypatch):
         assert files[file] == live.colors(name) and len(files[file]) == 4 * len(scene.splats)
     assert len(set(map(files.get, offered.values()))) > 1
     assert json.loads(live.files()["scene.json"])["looks"]["all/0003.jpg"] == "api/look?photo=all/0003.jpg"
-    monkeypatch.setattr("lang3dxl_ns.query.web.write_page._MOST_BYTES", 4 * len(scene.splats))
+    monkeypatch.setattr("lang3dxl_ns.web.write_page._MOST_BYTES", 4 * len(scene.splats))
     assert len(json.loads(static.files()["scene.json"])["looks"]) == 1
     assert any("lightings are left out" in told for told in static.left_out)
 
@@ -724,7 +724,7 @@ def test_a_field_takes_eight_bytes_a_gaussian():
 
 
 def test_a_decoder_too_wide_for_a_page_is_refused_in_a_sentence(monkeypatch, scene):
-    monkeypatch.setattr("lang3dxl_ns.query.web.pack._MOST_ROW_BYTES", 1000)
+    monkeypatch.setattr("lang3dxl_ns.web.pack._MOST_ROW_BYTES", 1000)
     with pytest.raises(UserError, match="preset `short`"):
         Page(scene)
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.components.step_guard import StepGuard
+from lang3dxl_ns.training.step_guard import StepGuard
 
 
 def group(gradient: float) -> dict[str, list[torch.Tensor]]:

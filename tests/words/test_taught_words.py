@@ -10,12 +10,12 @@ import torch
 from painted_scene import Painted, painted_codes, painted_gaussians, painted_scene, painted_splats
 
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.query import learn_word
-from lang3dxl_ns.query.learn_word import Weights, _logistic, _Photo
+from lang3dxl_ns.files.scene_file import read_scene, write_scene
 from lang3dxl_ns.query.scene import Scene
-from lang3dxl_ns.query.scene_file import read_scene, write_scene
-from lang3dxl_ns.query.teach import Example, load_words, save_words
 from lang3dxl_ns.rendering import Splats
+from lang3dxl_ns.words import learn_word
+from lang3dxl_ns.words.learn_word import Weights, _logistic, _Photo
+from lang3dxl_ns.words.taught_words import Example, load_words, save_words
 
 ALL = "all/0003.jpg"
 

@@ -1,6 +1,6 @@
-"""A run's folder: its search, and its scene description with the photos' names and cameras, and the CLIP.
+"""A scene's record: photos, cameras, frame, and the CLIP that its features come from.
 
-The description is written when training starts, so that a finished run can be queried without its photos.
+Training writes it at its start, so that a finished run can be queried without its photos.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from torch import Tensor
 
 from lang3dxl_ns.common.checks import expect, is_coordinate
 from lang3dxl_ns.common.errors import UserError, readable
-from lang3dxl_ns.common.files import expanded, read_json, write_atomically
+from lang3dxl_ns.common.files import read_json, write_atomically
 from lang3dxl_ns.common.image import resize_nearest
 from lang3dxl_ns.scene.camera import Camera, Lens, check_pose, view_matrix
 from lang3dxl_ns.scene.companions import is_name
@@ -33,11 +33,6 @@ from lang3dxl_ns.scene.photo import Photo
 SCENE_FILE = "lang3dxl_scene.json"
 """Name of the scene description, which lies beside config.yml."""
 _VERSION = 2
-OUTPUTS = Path("outputs")
-"""Folder in which `ns-train` creates runs."""
-_REMEDY = "name a run's folder or config.yml, or train with ns-train lang3dxl --data FOLDER"
-_DEEPEST = 4
-"""Deepest level of a run's folder below the given one; outputs/ holds SCENE/METHOD/TIME."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -123,7 +118,7 @@ class ScenePhoto:
 
 
 @dataclass(frozen=True)
-class SceneFile:
+class SceneRecord:
     """Contents of a run's scene description."""
 
     photos: list[ScenePhoto]
@@ -144,7 +139,7 @@ class SceneFile:
         write_atomically(path, json.dumps({"version": _VERSION, **asdict(self)}) + "\n")
 
     @classmethod
-    def read(cls, path: Path) -> SceneFile:
+    def read(cls, path: Path) -> SceneRecord:
         """Read the file. Raises UserError if it is missing, damaged, or of another version."""
         if not path.is_file():
             raise UserError(f"{path.parent} has no {path.name}, which training writes: copy the whole folder")
@@ -172,11 +167,11 @@ class SceneFile:
         raise UserError(f"the scene has no photo {name!r}: it has {len(names)}, such as {', '.join(similar)}")
 
 
-def scene_from_json(content: dict[str, Any]) -> SceneFile:
+def scene_from_json(content: dict[str, Any]) -> SceneRecord:
     """Build the description from a JSON object, after validating all its values. Raises ValueError, KeyError,
     TypeError or AttributeError for anything else."""
     photos = [_photo(**photo) for photo in content["photos"]]
-    scene = SceneFile(**{**content, "photos": photos})
+    scene = SceneRecord(**{**content, "photos": photos})
     expect(photos != [], "it lists no photo")
     expect(len({photo.name for photo in photos}) == len(photos), "a photo is listed twice")
     for text in (scene.clip, scene.clip_identity):
@@ -214,43 +209,3 @@ def overview(photos: Sequence[ScenePhoto], middle: tuple[float, ...]) -> ScenePh
         if z > farthest and max(wide, high) < z / 4:
             best, farthest = photo, float(z)
     return best
-
-
-def read_camera_path(path: Path) -> Sequence[Camera]:
-    """Read the cameras of a camera path saved by nerfstudio's viewer. Raises UserError for other files."""
-    with readable(f"{path} is not a camera path", "save one in the viewer (Render tab, Save Path)"):
-        content = read_json(path)
-        width, height = int(content["render_width"]), int(content["render_height"])
-        expect(content["camera_path"] != [], "it has no camera")
-        return [_path_camera(frame, width, height) for frame in content["camera_path"]]
-
-
-def _path_camera(frame: dict[str, Any], width: int, height: int) -> Camera:
-    pose = torch.tensor(frame["camera_to_world"], dtype=torch.float32).reshape(4, 4)
-    check_pose(pose.tolist())
-    expect(0 < frame["fov"] < 180, f"a camera has a field of view of {frame['fov']} degrees")
-    focal = height / 2 / math.tan(math.radians(frame["fov"]) / 2)
-    lens = Lens(width, height, focal, focal, width / 2, height / 2)
-    lens.check()
-    return lens.camera(view_matrix(pose[:3]))
-
-
-def find_config(run: str | Path | None = None) -> Path:
-    """Find the config.yml of a run: the file itself, or that in the run's folder, or in a folder above it,
-    whose newest run is taken; None: the newest run under outputs/. Runs of other methods, which lack a scene
-    description, are skipped. Raises UserError if there is no run."""
-    place = OUTPUTS if run is None else expanded(run)
-    if place.is_dir():
-        if place.joinpath("config.yml").is_file():
-            return place / "config.yml"
-        found = (path for n in range(1, _DEEPEST + 1) for path in place.glob("*/" * n + "config.yml"))
-        configs = [path for path in found if path.is_file()]
-        ours = [path for path in configs if path.with_name(SCENE_FILE).is_file()]
-        if ours:
-            return max(ours, key=lambda path: path.stat().st_mtime)
-        others = f" of this method ({len(configs)} of others)" if configs else ""
-        raise UserError(f"{place} holds no run{others}: {_REMEDY}")
-    if not place.is_file():
-        what = "there is no outputs/ here" if run is None else f"{place} is not a file or folder"
-        raise UserError(f"{what}: {_REMEDY}")
-    return place

@@ -5,8 +5,9 @@ import os
 import pytest
 
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.files.runs import find_config
 from lang3dxl_ns.open_scene import existing_scene_file
-from lang3dxl_ns.query.run_file import SCENE_FILE, find_config
+from lang3dxl_ns.scene.record import SCENE_FILE
 
 
 @pytest.fixture

@@ -17,10 +17,10 @@ from torch import Tensor
 from lang3dxl_ns.query.doubt import doubtful
 from lang3dxl_ns.query.match import Found
 from lang3dxl_ns.query.question import QueryConfig, Question, pictures
-from lang3dxl_ns.query.run_file import SceneFile
 from lang3dxl_ns.query.scene import Scene, text_encoder
 from lang3dxl_ns.query.text import EncodeTexts, caution
 from lang3dxl_ns.rendering import Rendering
+from lang3dxl_ns.scene.record import SceneRecord
 
 _LONGEST = 40
 """Most characters of a prompt in the summary."""
@@ -34,7 +34,7 @@ class Conversation:
 
     model: Any
     """A `Lang3DXLModel`, trained or in training."""
-    file: SceneFile
+    file: SceneRecord
     """Photos, cameras and CLIP."""
     run: Path
     """Folder of the run, which keeps results that are computed once."""

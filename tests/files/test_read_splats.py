@@ -13,8 +13,8 @@ from moved_splats import with_colors
 from numpy.lib import recfunctions
 
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.query.read_splats import find_splats, read_splats
-from lang3dxl_ns.query.splat_file import log_scales, logits, write_splats
+from lang3dxl_ns.files.read_splats import find_splats, read_splats
+from lang3dxl_ns.files.splat_file import log_scales, logits, write_splats
 from lang3dxl_ns.rendering import Splats
 
 

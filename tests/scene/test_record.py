@@ -10,11 +10,12 @@ from painted_scene import painted_scene
 from PIL import Image
 
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.query.learn_word import _marks
-from lang3dxl_ns.query.run_file import SceneFile, ScenePhoto, read_camera_path
-from lang3dxl_ns.query.teach import Example
 from lang3dxl_ns.scene.camera import Lens, camera_to_world, posed, resized, view_matrix
+from lang3dxl_ns.scene.camera_path import read_camera_path
 from lang3dxl_ns.scene.photo import Photo, turned_lens
+from lang3dxl_ns.scene.record import ScenePhoto, SceneRecord
+from lang3dxl_ns.words.learn_word import _marks
+from lang3dxl_ns.words.taught_words import Example
 
 
 @pytest.fixture
@@ -24,7 +25,7 @@ def file():
 
 def test_it_reads_what_it_wrote(file, tmp_path):
     file.write(tmp_path / "scene.json")
-    assert SceneFile.read(tmp_path / "scene.json") == file
+    assert SceneRecord.read(tmp_path / "scene.json") == file
 
 
 @pytest.mark.parametrize("quarters", [0, 1, 2, 3])
@@ -38,9 +39,9 @@ def test_a_mask_of_a_turned_photo_is_that_of_training(quarters, tmp_path):
     photo = ScenePhoto(
         "a", "train", pose, Lens(30, 20, 30, 30, 15, 10), f"{tmp_path}/mask.png", None, quarters
     )
-    about = SceneFile([photo], None, None, 1.0, [[1.0, 0, 0, 0], [0, 1.0, 0, 0], [0, 0, 1.0, 0]], "data")
+    about = SceneRecord([photo], None, None, 1.0, [[1.0, 0, 0, 0], [0, 1.0, 0, 0], [0, 0, 1.0, 0]], "data")
     about.write(tmp_path / "scene.json")
-    (found,) = SceneFile.read(tmp_path / "scene.json").photos
+    (found,) = SceneRecord.read(tmp_path / "scene.json").photos
     assert found == photo
     assert np.array_equal(found.foreground(), upright > 0)
 
@@ -52,9 +53,9 @@ def test_marks_are_pixels_of_the_file_where_training_read_it_smaller(turns, tmp_
     upright = Photo("a", tmp_path / "a.png", None, turned_lens(lens, turns), turns)
     pose = [[1.0, 0, 0, 0], [0, 1.0, 0, 0], [0, 0, 1.0, 0]]
     described = ScenePhoto.of(upright.at_most(20), "train", pose, 0.5)
-    about = SceneFile([described], None, None, 1.0, pose, "data")
+    about = SceneRecord([described], None, None, 1.0, pose, "data")
     about.write(tmp_path / "scene.json")
-    (photo,) = SceneFile.read(tmp_path / "scene.json").photos
+    (photo,) = SceneRecord.read(tmp_path / "scene.json").photos
     assert photo == described
     width, height = photo.file_size
     assert (width, height) == ((30, 40) if turns else (40, 30))
@@ -65,7 +66,7 @@ def test_marks_are_pixels_of_the_file_where_training_read_it_smaller(turns, tmp_
 
 def test_a_missing_file_is_explained(tmp_path):
     with pytest.raises(UserError, match="copy the whole folder"):
-        SceneFile.read(tmp_path / "scene.json")
+        SceneRecord.read(tmp_path / "scene.json")
 
 
 @pytest.mark.parametrize("name", ["left/0001.jpg", "0001.jpg", "0001"])

@@ -23,7 +23,7 @@ from viser import _messages
 from websockets.datastructures import Headers
 from websockets.legacy.server import WebSocketServerProtocol
 
-from lang3dxl_ns.query.web.access import Access, Response
+from lang3dxl_ns.web.access import Access, Response
 
 RENDER_NAME = "Render name"
 """Label of nerfstudio's text box whose content becomes a file name."""

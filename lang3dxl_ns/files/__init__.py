@@ -1,0 +1,1 @@
+"""Files of scenes: our own format, splats of every program, and runs."""

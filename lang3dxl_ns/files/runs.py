@@ -1,0 +1,36 @@
+"""Search for the folders of runs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.files import expanded
+from lang3dxl_ns.scene.record import SCENE_FILE
+
+OUTPUTS = Path("outputs")
+"""Folder in which `ns-train` creates runs."""
+_REMEDY = "name a run's folder or config.yml, or train with ns-train lang3dxl --data FOLDER"
+_DEEPEST = 4
+"""Deepest level of a run's folder below the given one; outputs/ holds SCENE/METHOD/TIME."""
+
+
+def find_config(run: str | Path | None = None) -> Path:
+    """Find the config.yml of a run: the file itself, or that in the run's folder, or in a folder above it,
+    whose newest run is taken; None: the newest run under outputs/. Runs of other methods, which lack a scene
+    description, are skipped. Raises UserError if there is no run."""
+    place = OUTPUTS if run is None else expanded(run)
+    if place.is_dir():
+        if place.joinpath("config.yml").is_file():
+            return place / "config.yml"
+        found = (path for n in range(1, _DEEPEST + 1) for path in place.glob("*/" * n + "config.yml"))
+        configs = [path for path in found if path.is_file()]
+        ours = [path for path in configs if path.with_name(SCENE_FILE).is_file()]
+        if ours:
+            return max(ours, key=lambda path: path.stat().st_mtime)
+        others = f" of this method ({len(configs)} of others)" if configs else ""
+        raise UserError(f"{place} holds no run{others}: {_REMEDY}")
+    if not place.is_file():
+        what = "there is no outputs/ here" if run is None else f"{place} is not a file or folder"
+        raise UserError(f"{what}: {_REMEDY}")
+    return place

@@ -1,0 +1,1 @@
+"""Words that a scene was taught by example."""
