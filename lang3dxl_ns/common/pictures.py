@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from lang3dxl_ns.common.errors import DAMAGE
+from lang3dxl_ns.common.errors import DAMAGE, not_of_memory
 
 FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP", "GIF", "AVIF")
 """Accepted formats, whatever the file's name. Some of Pillow's others start programs (EPS: Ghostscript)."""
@@ -35,6 +35,7 @@ def open_picture(path: Path) -> Iterator[Image.Image]:
     except (*DAMAGE, SyntaxError, Image.DecompressionBombError) as error:
         if isinstance(error, OSError) and error.errno is not None:  # an error of the disk, not of the decoder
             raise
+        not_of_memory(error)
         raise NoPictureError(str(error) or type(error).__name__) from error
 
 

@@ -25,7 +25,7 @@ from torch import Tensor
 
 from lang3dxl_ns.common.checks import expect
 from lang3dxl_ns.common.console import say
-from lang3dxl_ns.common.errors import DAMAGE, UserError, in_a_line
+from lang3dxl_ns.common.errors import DAMAGE, UserError, in_a_line, not_of_memory
 from lang3dxl_ns.common.files import expanded
 from lang3dxl_ns.common.memory import machine_memory
 from lang3dxl_ns.rendering import Splats, harmonics_of
@@ -82,6 +82,7 @@ def read_splats(path: str | Path) -> Splats:
     except UserError as error:
         raise UserError(f"{path}: {error}") from error
     except DAMAGE as error:
+        not_of_memory(error)
         reason = in_a_line(error)
         raise UserError(f"{path} is damaged or incomplete ({reason}): copy or export it again") from error
     return _finite(splats, path)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import torch
 
+from lang3dxl_ns.common.kernels import MOST_SUMS
 from lang3dxl_ns.common.memory import machine_memory
 from lang3dxl_ns.plugin.model import Lang3DXLModel
 
@@ -35,7 +36,8 @@ def bytes_of(model: Lang3DXLModel, pixels: int) -> tuple[float, float]:
     words = WORDS if model.semantic_field is not None and model.semantic_field.needs_lifting else 0.0
     codes = model.gauss_params.get("codes") if model.learns_from_renderings else None
     of_codes = 0.0 if codes is None else PER_CODE * codes.shape[1]
-    fixed = PER_PARAMETER * others + max(PER_PIXEL * pixels, words)
+    many = model.device.type == "cpu" and torch.get_num_threads() > 2  # of two, `PER_GAUSSIAN` has the sums
+    fixed = PER_PARAMETER * others + max(PER_PIXEL * pixels, words) + many * MOST_SUMS
     looks = 0.0 if model.appearance is None else PER_LOOK
     return fixed, PER_PARAMETER * numbers + PER_GAUSSIAN + of_codes + looks
 

@@ -44,7 +44,7 @@ from lang3dxl_ns.query.vocabulary import CLEAR, NOTHING, searched, shipped_vocab
 from lang3dxl_ns.rendering import Backend, Rendering, Splats, composite
 from lang3dxl_ns.rendering.gathering import filled_pixels
 from lang3dxl_ns.scene.camera import Camera, posed, resized, with_field_of_view, with_longer_side
-from lang3dxl_ns.scene.record import ScenePhoto, SceneRecord, overview
+from lang3dxl_ns.scene.record import ScenePhoto, SceneRecord, overview, same_clip
 from lang3dxl_ns.words.learn_word import Weights, learn
 from lang3dxl_ns.words.taught_words import Example, TaughtWord, known_word
 
@@ -550,7 +550,8 @@ class Scene:
         if word.scene == Path(self.file.data).name and len(marked) > len(word.examples) / 2:
             with suppress(UserError):
                 return self.teach(word.name, marked)
-        if len(word.vector) != self._semantics()[0].clip_dim or word.clip != self.file.clip_identity:
+        same = same_clip(word.clip, self.file.clip_identity)
+        if len(word.vector) != self._semantics()[0].clip_dim or not same:
             raise UserError(f"{word.name!r} was learned with another CLIP than this scene's: teach it anew")
         return self.with_words([*self.words.values(), replace(word, examples=(), precision={})])
 
@@ -656,7 +657,7 @@ def text_encoder(file: SceneRecord, device: torch.device | str) -> EncodeTexts:
     if file.clip is None:
         raise UserError(NO_SEMANTICS)
     encoder = load_image_text_encoder(file.clip, device)
-    if encoder.identity != file.clip_identity:
+    if not same_clip(encoder.identity, file.clip_identity):
         raise UserError(
             f"the CLIP in {file.clip} is not the one that this scene was made with: restore it, or train anew"
         )

@@ -14,7 +14,6 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
-from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.query.doubt import UNRELATED
 from lang3dxl_ns.query.relevancy import Queries
@@ -71,7 +70,8 @@ def parse_prompts(typed: str) -> list[Prompt]:
     `not` is special only before a quoted phrase (several: `not "a", "b"`), so that phrases may contain the
     word. A `;` in quotes doesn't separate. Raises UserError if there is no prompt."""
     (clean,) = texts_of([typed], "a prompt")
-    clean = _SINGLE_QUOTES.sub(r'"\1"', clean.translate(_CURLY_QUOTES))
+    # Single spaces, since runs of them would take patterns a time that grows with their square.
+    clean = " ".join(_SINGLE_QUOTES.sub(r'"\1"', clean.translate(_CURLY_QUOTES)).split())
     parts = re.findall(rf"(?:{_QUOTED}|[^;])+", clean)
     prompts = [_parse_prompt(part) for part in parts if part.strip(' "\t\r\n\0')]
     if not prompts:
@@ -82,11 +82,6 @@ def parse_prompts(typed: str) -> list[Prompt]:
 def _parse_prompt(part: str) -> Prompt:
     negatives = [tidy(phrase) for found in _NEGATIVES.findall(part) for phrase in found.split('"')[1::2]]
     text = tidy(_NEGATIVES.sub(" ", part))
-    if found := re.fullmatch(r"(.+) not(?: (.+))?", text, re.IGNORECASE):
-        say(
-            f"{text} is searched for as it stands. To tell one thing from another: "
-            f'"{found[1]}" not "{found[2] or "…"}"'
-        )
     if not text:
         raise UserError(f"{part.strip()!r} has only negatives: put what to find first")
     return Prompt(text, tuple(negative for negative in negatives if negative))
@@ -114,11 +109,17 @@ _NO_NAME = re.compile(r"an?|the|and|or|of|in|on|at|to|it|is|are|this|that|these|
 
 def caution(text: str) -> str | None:
     """Return a warning about a prompt that names nothing, such as *the* or *42*, or that has words which CLIP
-    can't tell (places, sizes, colors); None for others."""
+    can't tell (places, sizes, colors, an unquoted *not*); None for others."""
     if all(_NO_NAME.fullmatch(word) for word in re.findall(r"\w+", text.casefold())):
         return f"{text} names nothing that can be seen: what follows is chance"
     if (found := searched(text)) != text:
         return f"places and sizes are not told apart: {found} is searched for everywhere"
+    first, *other = re.split(" not(?: |$)", text, maxsplit=1, flags=re.IGNORECASE)
+    if other:
+        return (
+            f"{text} is searched for as it stands. To tell one thing from another: "
+            f'"{first}" not "{other[0] or "…"}"'
+        )
     if len(text.split()) > _MOST_WORDS:
         return f"CLIP reads about {_MOST_WORDS} words: the rest of this prompt is ignored"
     if color := _COLOR.search(text):

@@ -388,7 +388,7 @@ async function light() {
 // ── start ──
 
 async function fetched(name) {
-  const file = await fetch(name);
+  const file = await fetch(about?.files?.[name] ?? name); // a written page's data have names by content
   if (!file.ok) throw new Error(`${name} is missing (${file.status}): write the page again.`);
   return file;
 }
