@@ -16,7 +16,7 @@ Center = Literal["poses", "focus", "none"]
 COLMAP_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 """Rotation from COLMAP's usual y down to z up."""
 _LOST = 100
-"""Distance, relative to the typical one, from which a camera is lost: it would see the scene in ten pixels."""
+"""Distance, relative to the typical one, from which a camera is lost: it sees the scene in ten pixels."""
 _MOST_LOST = 1 / 4
 """Largest share of cameras that can be lost. Where more stand apart, they are another part of the scene."""
 _PARALLEL = 0.17
