@@ -192,6 +192,8 @@ class Lang3DXLTrainerConfig(TrainerConfig):
         if not (run / "config.yml").is_file():
             return
         earlier: Any = read_config(run / "config.yml").pipeline
+        if self.pipeline.datamanager.clip == "auto":
+            self.pipeline.datamanager.clip = earlier.datamanager.clip
         earlier = earlier.model
         needs, mine = read_needs(run), self.pipeline.model
         for part in ("semantic_field", "appearance"):
