@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
+from statistics import median
 from time import perf_counter
 from types import FrameType
 from typing import Any, Literal
@@ -305,16 +306,19 @@ class Lang3DXLTrainer(Trainer):
     @torch.no_grad()
     def _announce_time(self) -> None:
         """Log how long training and learning words will take with the present Gaussians. The estimate comes
-        from rendering a photo's view for the second time, since the first may compile kernels."""
+        from the median of five renderings of a photo's view, since the first may compile kernels, and others
+        may wait for another program."""
         model, cameras = self.pipeline.model, self.pipeline.datamanager.train_dataset.cameras
         middle = int((cameras.width * cameras.height).flatten().argsort()[len(cameras) // 2])
         with self.train_lock:  # the viewer may render at the same time
             model.eval()
-            for _ in range(2):
+            times = []
+            for _ in range(5):
                 start = perf_counter()
                 model.get_outputs(cameras[middle : middle + 1])
                 synchronize()
-            rendering = perf_counter() - start
+                times.append(perf_counter() - start)
+            rendering = median(times)
             model.train()
         count, decoder = self.config.max_num_iterations, model.semantic_field
         seconds, words = rendering * count * RENDERINGS_PER_STEP[model.learns_from_renderings], 0.0
