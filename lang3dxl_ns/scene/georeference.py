@@ -1,7 +1,7 @@
 """Meters, up and north of a scene, from the GPS positions that phones and drones write into photos.
 
-Photos taken on foot lie nearly on a line or in a plane, and their altitudes are off by many meters. So up comes
-from the cameras, and GPS gives what is left: scale and heading.
+Photos taken on foot lie nearly on a line or in a plane, and their altitudes are off by many meters. So up
+comes from the cameras, and GPS gives what is left: scale and heading.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class Georeference:
 
 
 def gps_position(photo: Path) -> tuple[float, float, float] | None:
-    """Read a photo's latitude and longitude in degrees and altitude in meters (0 if unknown) from its EXIF data.
+    """Read a photo's latitude and longitude in degrees and altitude in meters (0 if unknown) from EXIF.
     The result is None if they are missing or impossible."""
     try:
         with open_picture(photo) as image:
