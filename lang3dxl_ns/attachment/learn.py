@@ -109,4 +109,4 @@ def scene_file(
         scale=scale,
         transform=(similarity[:3] / scale).tolist(),
         data=str(collection.folder),
-    )
+    ).located(collection.photos)

@@ -276,7 +276,7 @@ class Lang3DXLDataManager(FullImageDatamanager):
             scale=frame.scale,
             transform=frame.transform.tolist(),
             data=str(expanded(self.data_folder).absolute()),
-        )
+        ).located(self.photos.values())
 
     def _described(
         self, dataset: PhotoDataset, split: Literal["train", "eval"], poses: Tensor | None = None

@@ -10,12 +10,14 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float64
 from numpy import ndarray as Array
 from PIL import ExifTags
 
+from lang3dxl_ns.common.checks import expect, is_coordinate
 from lang3dxl_ns.common.pictures import NoPictureError, open_picture
 
 LEAST_PHOTOS = 3
@@ -47,6 +49,18 @@ class Georeference:
     def __str__(self) -> str:
         size = f"1 unit is {self.meters:.3g} m ± {self.uncertainty:.0%}"
         return f"{size}, by the GPS positions of {self.photos} photos"
+
+
+def georeference_from_json(content: dict[str, Any]) -> Georeference:
+    """Build a georeference from a JSON object. Raises ValueError, KeyError or TypeError for anything else."""
+    found = Georeference(**{**content, "up": tuple(content["up"]), "north": tuple(content["north"])})
+    for number in (found.meters, found.uncertainty):
+        expect(is_coordinate(number) and number > 0, f"its meters are {number!r}")
+    for axis in (found.up, found.north):
+        known = len(axis) == 3 and all(is_coordinate(value) for value in axis)
+        expect(known and abs(np.linalg.norm(axis) - 1) < 1e-3, f"a direction is {axis!r}")
+    expect(isinstance(found.photos, int), f"it has GPS of {found.photos!r} photos")
+    return found
 
 
 def gps_position(photo: Path) -> tuple[float, float, float] | None:

@@ -6,7 +6,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.scene.camera import Lens
 from lang3dxl_ns.scene.georeference import georeference, gps_position, local_meters
+from lang3dxl_ns.scene.photo import Photo
+from lang3dxl_ns.scene.record import ScenePhoto, SceneRecord
 
 BERN = (46.947, 7.444, 540.0)
 
@@ -85,6 +89,32 @@ def test_the_error_of_gps_is_within_what_is_told():
 def test_where_gps_tells_nothing_there_are_no_meters(positions):
     turn = rotation(0)
     assert georeference(in_frame(walk(), turn, 2.0), turn[:, 2], positions) is None
+
+
+def test_a_record_keeps_meters_and_forgets_places(tmp_path):
+    places, turn = walk(), rotation(2)
+    centers, photos, described = in_frame(places, turn, 2.0), [], []
+    lens = Lens(8, 6, 8.0, 8.0, 4.0, 3.0)
+    for i, (center, place) in enumerate(zip(centers, places, strict=True)):
+        latitude, longitude, _ = degrees_at(*place)
+        path = tmp_path / f"{i}.jpg"
+        with_gps(path, {1: "N", 2: (latitude, 0.0, 0.0), 3: "E", 4: (longitude, 0.0, 0.0)})
+        photos.append(Photo(path.name, path, None, lens))
+        east = turn[:, 0]
+        pose = np.column_stack([east, turn[:, 2], np.cross(east, turn[:, 2]), center]).tolist()
+        described.append(ScenePhoto.of(photos[-1], "train", pose, 1.0))
+    identity = np.eye(4)[:3].tolist()
+    record = SceneRecord(described, None, None, 1.0, identity, str(tmp_path)).located(photos)
+    assert record.georeference is not None
+    assert record.georeference.meters == pytest.approx(2.0, rel=1e-3)
+    record.write(tmp_path / "scene.json")
+    text = (tmp_path / "scene.json").read_text()
+    assert "46.9" not in text
+    assert SceneRecord.read(tmp_path / "scene.json") == record
+    for wrong in ('"meters": ', '"meters": -'), ('"up": [', '"up": [7.0, '):
+        (tmp_path / "scene.json").write_text(text.replace(*wrong))
+        with pytest.raises(UserError, match="can't be read"):
+            SceneRecord.read(tmp_path / "scene.json")
 
 
 def test_meters_hold_across_the_date_line():
