@@ -140,7 +140,7 @@ class SceneRecord:
     data: str
     """Folder of the photos that the run was trained on."""
     georeference: Georeference | None = None
-    """Meters, up and north, if GPS positions of the photos tell them. The positions themselves are not kept."""
+    """Meters, up and north, if the photos tell their GPS positions, which are not kept."""
 
     def located(self, photos: Iterable[Photo]) -> SceneRecord:
         """Return the record with meters, up and north, if the photos' files tell them."""
