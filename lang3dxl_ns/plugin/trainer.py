@@ -211,8 +211,7 @@ class Lang3DXLTrainer(Trainer):
         """Check that a checkpoint's photos are this run's. Raises UserError for another frame, and, if the
         cameras were `corrected` one by one, for other training photos."""
         data = self.pipeline.datamanager
-        new = data.train_dataparser_outputs
-        if not before.has_frame(new.dataparser_transform, new.dataparser_scale):
+        if not before.has_frame(data.frame.transform, data.frame.scale):
             raise UserError(f"{path} is of other photos, or of another reconstruction of them: train anew")
         splits = [{p.name: p.split for p in file.photos} for file in (before, data.scene_file())]
         trained = [[name for name, split in known.items() if split == "train"] for known in splits]

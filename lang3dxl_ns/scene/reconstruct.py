@@ -46,7 +46,9 @@ if TYPE_CHECKING:
 _MEMORY_PER_THREAD = 1e9  # bytes that SIFT takes on a photo of 1600 pixels, the default `max_size`
 _FEW_FEATURES = 50
 _SMALLEST_MODEL = 3  # photos; COLMAP's default of ten may exceed the number of photos
-_CONVERTED = (".webp", ".gif", ".avif")  # formats that Pillow reads and COLMAP does not
+_ENDINGS = {"JPEG": ".jpg", "MPO": ".jpg", "PNG": ".png", "TIFF": ".tif", "BMP": ".bmp"}
+"""Formats that COLMAP reads; others become JPEGs of this quality."""
+_QUALITY = 98
 _CHUNK_PHOTOS, _CHUNK_PAIRS = 8, 100  # per step of the progress bar; a killed process loses one step
 _STAMP = "photos.json"
 _RELAXED = {"init_min_num_inliers": 30, "init_min_tri_angle": 4.0, "abs_pose_min_num_inliers": 15}
@@ -172,12 +174,13 @@ def _numbered(photos: PhotoFolder, work: Path) -> PhotoFolder:
     folder.mkdir(parents=True)
     numbers = []
     for index, name in enumerate(photos.names):
-        source, suffix = photos.folder / name, Path(name).suffix.lower()
+        source = photos.folder / name
         with open_picture(source) as image:  # browsers save WebP under other endings
-            foreign = suffix in _CONVERTED or f".{image.format}".lower() in _CONVERTED
-            number = f"{index:06d}{'.png' if foreign else suffix}"
-            if foreign:
-                image.convert("RGB").save(folder / number)
+            foreign = image.format not in _ENDINGS
+            number = f"{index:06d}{_ENDINGS.get(image.format or '', '.jpg')}"
+            if foreign:  # COLMAP reads the focal length from EXIF
+                exif = image.info.get("exif", b"")
+                image.convert("RGB").save(folder / number, quality=_QUALITY, subsampling=0, exif=exif)
         if not foreign:
             try:
                 (folder / number).symlink_to(source.absolute())
