@@ -23,6 +23,7 @@ import torch
 import torch.nn.functional as F
 import tyro
 from jaxtyping import Float
+from lang3dxl_ns.preparation.photo_collection import read_collection
 from PIL import Image
 from torch import Tensor
 
@@ -40,7 +41,6 @@ from lang3dxl_ns.preparation.encoders import (
     load_dense_encoder,
     load_image_text_encoder,
 )
-from lang3dxl_ns.preparation.photo_collection import read_collection
 from lang3dxl_ns.preparation.pyramid import THIRD, build_clip_target
 from lang3dxl_ns.preparation.settings import PreparationConfig
 from lang3dxl_ns.preparation.targets import TargetReader
