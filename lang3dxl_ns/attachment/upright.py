@@ -33,7 +33,7 @@ _STARTS, _ROUNDS = 24, 12
 _AZIMUTHS, _DISTANCE, _ELEVATION = 6, 2.2, 0.15
 """Views around the scene: their number, distance in radii, and height as an angle in radians."""
 _LENS = Lens(128, 128, 115.0, 115.0, 64.0, 64.0)
-_WALLS, _CERTAINTY = 2.0, 10.0
+_WALLS, _CERTAINTY = 1.0, 10.0
 """Weights of the share of walls, and of how well words fit, beside those of the sky and of doors."""
 
 

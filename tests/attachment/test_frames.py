@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from box_splat import box_splat
+from lang3dxl_ns.preparation.photo_collection import read_collection
 from moved_splats import transformed, with_colors
 from scenes import write_scene
 from scipy.spatial.transform import Rotation
@@ -14,7 +15,6 @@ from lang3dxl_ns.attachment import frames
 from lang3dxl_ns.attachment.frames import Fit, camera_in, find_frame
 from lang3dxl_ns.attachment.known_frames import RUN_TRANSFORM, known_frames, registered_frames
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.preparation.photo_collection import read_collection
 from lang3dxl_ns.rendering import render
 
 
