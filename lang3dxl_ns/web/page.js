@@ -438,7 +438,7 @@ function listen() {
   });
   on("boxed", "change", () => (drawBoxes(), keepAddress()));
   on("clear", "click", clear);
-  on("overview", "click", () => (photos.hide(), view.mover.overview()));
+  on("overview", "click", () => (photos.hide(), quiet(), view.mover.overview()));
   on("teach", "click", () => startWord().card.querySelector("input").focus());
   on("still", "click", saveStill);
   on("link", "click", copyLink);
@@ -533,7 +533,7 @@ function hideFloaters() {
   if (!view.floats) return;
   const limit = 255 - Math.round(2.55 * Number($("hide").value));
   view.hide(view.floats, limit);
-  think("hide", { floats: view.floats, limit });
+  if (about.words) think("hide", { floats: view.floats, limit });
 }
 
 // ── start ──
@@ -572,9 +572,13 @@ async function readMeaning(splats) {
   Object.assign(about, { known, seconds });
   say(explain(about));
   attempt(suggest);
-  if (!about.floaters) return;
+}
+
+/** Read which Gaussians float, once the page answers. */
+async function readFloaters() {
   view.floats = new Uint8Array(await (await fetched(about.floaters)).arrayBuffer());
   $("floating").hidden = false;
+  hideFloaters();
 }
 
 /** Keep the eye in the free space from now on. */
@@ -589,6 +593,8 @@ async function begin() {
   const turn = cleared;
   view.mover.first = location.hash.length > 1 ? null : view.mover.address;
   if (about.words) setTimeout(() => think("space").then(limit)); // behind the prompts
+  setTimeout(() => attempt(readFloaters));
+  if (about.hide) $("hide").value = 50;
   if (location.hash.length > 1) return apply(location.hash, turn);
   for (const [text, ...negatives] of about.prompts) if (turn === cleared) await ask(asTyped({ text, negatives }), turn);
   if (turn === cleared) settle("");
@@ -600,6 +606,7 @@ window.lang3dxl = {
   ask: (typed) => ask(typed),
   clear,
   whatIs,
+  prompts,
   get view() {
     return view;
   },
