@@ -69,9 +69,9 @@ export function asPython(examples, cameras) {
   for (const example of examples.filter(({ photo }) => photo !== undefined)) {
     const camera = cameras[example.photo], file = (points) => points.map((point) => inFile(point, camera));
     if (!photos.has(camera)) photos.set(camera, { photo: camera.name, points: [], not_points: [], size: camera.file, outlines: [] });
-    const found = photos.get(camera);
+    const found = photos.get(camera), pixels = (points) => file(points).map((place) => place.map((value) => Math.max(value - 0.5, 0))); // Python counts from pixels' centers
     if (example.outline && !example.without) found.outlines.push(file(example.outline));
-    else found[example.without ? "not_points" : "points"].push(...file(example.outline ? inside(example.outline) : example.points));
+    else found[example.without ? "not_points" : "points"].push(...pixels(example.outline ? inside(example.outline) : example.points));
   }
   return [...photos.values()]
     .map(({ outlines, ...rest }) => ({ ...rest, ...(outlines.length && { mask: maskOf(outlines, rest.size) }) }))

@@ -227,7 +227,9 @@ def picture(page) -> np.ndarray:
     before = None
     for _ in range(60):
         rest(page)
+        page.evaluate("document.getElementById('tools').style.opacity = 0")
         shot = page.locator("#frame canvas").screenshot()
+        page.evaluate("document.getElementById('tools').style.opacity = 1")
         now = np.asarray(Image.open(io.BytesIO(shot)).convert("RGB")).astype(int)
         if before is not None and now.any() and np.array_equal(now, before):
             return now
@@ -450,10 +452,10 @@ def test_ask_answers_and_hostile_texts_stay_texts(page):
     for text in (HOSTILE, "", ";;;", 'not "dome"', "x" * 5000, "__proto__", "constructor"):
         assert page.evaluate("(text) => lang3dxl.ask(text)", text)["known"] is False
     assert page.locator("h1").inner_text() == HOSTILE and page.title() == HOSTILE
-    assert page.locator("img").count() == 0
+    assert page.locator("img:not(#photo)").count() == 0
     page.evaluate("location.hash = 'view=nan,1,2&ask=%22%3Cimg%20src=x%3E&like=~x~-1.9e9~&not=%00'")
     page.wait_for_timeout(500)
-    assert page.locator("img").count() == 0
+    assert page.locator("img:not(#photo)").count() == 0
 
 
 @pytest.mark.slow
@@ -474,7 +476,7 @@ def test_at_the_width_of_a_phone_everything_is_in_reach(browser, address):
 @pytest.mark.slow
 def test_a_phone_opens_at_the_search_box_and_scrolls_to_what_is_asked(browser, address):
     page = opened(browser, address + "#ask=dome&ask=windows&ask=wall", PHONE)
-    page.get_by_text("wall", exact=True).wait_for()
+    page.locator("#prompts strong", has_text="wall").wait_for()
     scrolled = "document.getElementById('panel').scrollTop"
     assert page.evaluate(scrolled) == 0
     page.evaluate("lang3dxl.ask('wall')")
