@@ -2,7 +2,7 @@
 import { element, explain, matched, percent, promptCard, say, shown } from "./cards.js";
 import { Kept, readFields, Steps, written } from "./history.js";
 import { Photos } from "./photos.js";
-import { areExamples, asPython, drawOutline, examplesAsText, examplesFromText, inside, UNNAMED, wordsFile } from "./teach.js";
+import { areExamples, asPython, drawOutline, examplesAsText, examplesFromText, inside, rounded, UNNAMED, wordsFile } from "./teach.js";
 import { thinker } from "./think.js";
 import { parsePrompts, tidy } from "./vocabulary.js";
 import { View } from "./view.js";
@@ -266,7 +266,7 @@ async function addMark(prompt, pixels, without, outline = null) {
   const { rows, photo, points } = await think("mark", { camera: view.picking, pixels, prefer });
   if (!rows.length) return say("Nothing with a meaning is there: mark another place.");
   const index = about.cameras.findIndex(({ name }) => name === (inPhoto ? photos.shown.name : photo));
-  const place = index < 0 ? {} : inPhoto ? { photo: index, [outline ? "outline" : "points"]: there } : { photo: index, points };
+  const place = index < 0 ? {} : inPhoto ? { photo: index, [outline ? "outline" : "points"]: rounded(there) } : { photo: index, points: rounded(points) };
   prompt.examples.push({ rows, without: Boolean(without && prompt.examples.length), ...place });
   prompt.inScene = false;
   await answer(prompt);

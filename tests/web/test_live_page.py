@@ -1,4 +1,4 @@
-"""The page of `lang3dxl view` in Chromium: photos over the rendering, and words taught to the scene's file."""
+"""The page of `lang3dxl view` in Chromium: photos over the rendering, and words that its scene is taught."""
 
 import http.client
 import json
@@ -171,6 +171,7 @@ def test_a_photo_lies_exactly_over_the_rendering_and_leaves_with_the_eye(browser
         shown = place["width"] - float(clip.split()[1].removesuffix("px"))
         assert shown + place["x"] - corner["x"] == pytest.approx(0.25 * corner["width"], abs=1)
         assert f"photo={ALL.replace('/', '%2F')}" in page.url
+        page.evaluate("lang3dxl.view.mover.free = true")
         page.locator("#frame").press("ArrowLeft")
         page.locator("#over").wait_for(state="hidden")
         page.get_by_role("button", name="Cameras").click()
