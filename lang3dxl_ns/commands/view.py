@@ -72,6 +72,7 @@ class Info:
             "Gaussians": f"{count:,}",
             "photos": f"{told['photos']}{', each with its lighting' if told['looks'] else ''}",
             "words": words,
+            "meters": told["scene"].georeference,
             "size": f"{told['bytes'] / 1e6:.2f} MB, {told['bytes'] / max(count, 1):.0f} bytes a Gaussian",
         }
         say(*(f"{name:10} {' '.join(str(value).split())}" for name, value in lines.items() if value))

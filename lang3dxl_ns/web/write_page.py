@@ -17,15 +17,16 @@ from torch import Tensor
 from lang3dxl_ns.common.console import tracked
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import make_folder, write_atomically
+from lang3dxl_ns.common.pictures import PHOTO_SUFFIXES
 from lang3dxl_ns.files.scene_file import Provenance
 from lang3dxl_ns.query.doubt import BEST, DOUBTFUL, DOUBTFUL_TAUGHT, LEAST_PEAK
 from lang3dxl_ns.query.heat_maps import PROMPT_COLORS
-from lang3dxl_ns.query.question import EVEN, SHARE
+from lang3dxl_ns.query.negatives import CLEAR, NOTHING, competitors
 from lang3dxl_ns.query.scene import NO_SEMANTICS, Scene
 from lang3dxl_ns.query.text import Prompt, tidy
+from lang3dxl_ns.query.thresholds import EVEN, SHARE
 from lang3dxl_ns.query.visibility import spread
-from lang3dxl_ns.query.vocabulary import CLEAR, NOTHING, common_words, competitors, shipped_vocabulary
-from lang3dxl_ns.scene.photo_folder import PHOTO_SUFFIXES
+from lang3dxl_ns.query.vocabulary import common_words, shipped_vocabulary
 from lang3dxl_ns.web.pack import (
     LEAST_PIXELS,
     PIXEL_STEPS,
