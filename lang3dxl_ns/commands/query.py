@@ -39,7 +39,7 @@ _LEAST_PART = 1e-4
 _NEAREST = Image.Resampling.NEAREST
 _READ_BY: dict[str, tuple[str, ...]] = dict.fromkeys(("title", "credit", "license"), ("web", "scene_file"))
 _READ_BY |= dict.fromkeys(("text", "not_", "look"), ("out", "web"))
-_READ_BY |= {"vocabulary": ("web",), "photos": ("web",), "all": ("out",)}
+_READ_BY |= {"vocabulary": ("web",), "photos": ("web",), "all": ("out",), "hide_floaters": ("out", "web")}
 """Targets of `export` that read an option. Options that are not listed are read by every target."""
 _Not = Annotated[tyro.conf.UseAppendAction[list[str]], tyro.conf.arg(name="not")]
 
@@ -249,6 +249,8 @@ class Export:
     """Terms under which photos and scene may be used."""
     all: bool = False
     """Write all Gaussians. With --text, a .ply has their relevancy as a property."""
+    hide_floaters: bool = False
+    """Leave out Gaussians that float where no surface is, and the sky's. A page opens with them hidden."""
     index: Path | None = None
     """File (.npy or .txt) for the indices of the matching Gaussians, in the order of the scene, which is also
     the order of the splat that it was attached to. It needs --text and --out."""
@@ -288,6 +290,7 @@ class Export:
             own = read_names(self.vocabulary, "words") if self.vocabulary else ()
             words = self._clip_words(scene.file.clip)
             page = Page(scene, prompts, own, words, self._told(), self.look, self.photos)
+            page.hide_floaters = self.hide_floaters
             size = write_page(page, self.web)
             for left_out in page.left_out:
                 say(f"{left_out}.")
@@ -295,7 +298,8 @@ class Export:
             say(f"Wrote {size / 1e6:.1f} MB to {self.web}; see it: {see}")
         if self.out is not None:
             text = prompts[0] if prompts else None
-            count = scene.export(self.out, text, everything=self.all, look=self.look, index=self.index)
+            hide, how = self.hide_floaters, {"look": self.look, "index": self.index}
+            count = scene.export(self.out, text, everything=self.all, hide_floaters=hide, **how)
             say(f"Wrote {count} of {len(scene.splats)} Gaussians to {self.out}")
 
     def _clip_words(self, clip: str | None) -> tuple[str, ...]:

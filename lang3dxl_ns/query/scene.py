@@ -26,6 +26,7 @@ from lang3dxl_ns.files.splat_file import write_index, write_splats
 from lang3dxl_ns.preparation.encoders import load_image_text_encoder
 from lang3dxl_ns.query.doubt import DOUBTFUL, Doubts, doubtful
 from lang3dxl_ns.query.engine import QueryEngine, make_engine
+from lang3dxl_ns.query.floaters import FLOATS, floating
 from lang3dxl_ns.query.match import Found, Match, View
 from lang3dxl_ns.query.negatives import CLEAR, NOTHING
 from lang3dxl_ns.query.question import QueryConfig, Question
@@ -365,6 +366,7 @@ class Scene:
         everything: bool = False,
         look: str | None = None,
         index: str | Path | None = None,
+        hide_floaters: bool = False,
     ) -> int:
         """Write the Gaussians as a .ply or .spz file for splat viewers, in the scene's order, and return how
         many were written.
@@ -376,23 +378,26 @@ class Scene:
             look: training photo whose lighting is baked into the colors; default: the overview photo.
             index: with a text, a .npy or .txt file for the numbers of the matching Gaussians: their
                 positions, from 0, in the scene, and so in the splat that it was attached to.
+            hide_floaters: leave out the Gaussians that `floating` takes for floaters.
 
         Raises:
             UserError: nothing matches, or see `ask` and `write_splats`.
         """
         splats = self.baked(look)
+        solid = self.floating <= FLOATS if hide_floaters else self.splats.opacities >= 0
         if text is None:
-            return write_splats(expanded(path), splats)
+            return write_splats(expanded(path), splats.select(solid) if hide_floaters else splats)
         question = self._one(text, threshold)
-        relevancy, keep = question.relevancy[0], question.gaussians[0]
+        relevancy, keep = question.relevancy[0], question.gaussians[0] & solid
         if not everything and not keep.any():
             best, level = float(relevancy.max()), question.thresholds[0]
             raise UserError(
                 f"no Gaussian matches {question.prompts[0].text!r}: the best reaches {best:.2f}; lower "
                 f"--threshold, now {level:.2f}, or write all with their relevancy (--all)"
             )
-        if not everything:
-            splats, relevancy = splats.select(keep), relevancy[keep]
+        if not everything or hide_floaters:
+            written = solid if everything else keep
+            splats, relevancy = splats.select(written), relevancy[written]
         if index is not None:
             write_index(expanded(index), keep)
         return write_splats(expanded(path), splats, relevancy)
@@ -435,6 +440,11 @@ class Scene:
         for view in self.visible.values():
             mass[view.rows.long()] += view.pixels.float()
         return mass
+
+    @cached_property
+    def floating(self) -> Float[Tensor, " n"]:
+        """How surely each Gaussian is a floater, 0…1."""
+        return floating(self.splats, self.visible, self.draw)
 
     @cached_property
     def trained_side(self) -> int:
