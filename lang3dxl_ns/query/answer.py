@@ -42,10 +42,10 @@ def matches(scene: Answering, question: Question, place: Place, size: int | None
     maps, masks = question.maps(rendering, foreground)
     found = maps.cpu().float().numpy(), masks.cpu().numpy()
     seconds = asked - start + time.perf_counter() - rendered
-    rows = zip(question.prompts, question.doubts, *found, question.thresholds, strict=True)
+    rows = zip(question.prompts, question.doubts, question.trusts, *found, question.thresholds, strict=True)
     return [
-        Match(prompt, scene.synonyms(prompt), doubt, view, relevancy, mask, level, seconds)
-        for prompt, doubt, relevancy, mask, level in rows
+        Match(prompt, scene.synonyms(prompt), doubt, trust, view, relevancy, mask, level, seconds)
+        for prompt, doubt, trust, relevancy, mask, level in rows
     ]
 
 
@@ -66,7 +66,8 @@ def locate(scene: Answering, question: Question, most: int = 10) -> list[Found]:
         if views:
             box = strongest_match(scene.splats.means, scores, scene.mass, threshold, scene.gap)
         relevancy, matching = scores.cpu().float().numpy(), question.gaussians[row].cpu().numpy()
-        found.append(Found(prompt, views, box, relevancy, matching, question.doubts[row], threshold))
+        doubt, trust = question.doubts[row], question.trusts[row]
+        found.append(Found(prompt, views, box, relevancy, matching, doubt, trust, threshold))
     return found
 
 

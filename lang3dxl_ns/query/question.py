@@ -23,6 +23,7 @@ from lang3dxl_ns.query.engine import QueryEngine
 from lang3dxl_ns.query.heat_maps import overlay, strongest
 from lang3dxl_ns.query.relevancy import TEMPERATURE, Queries
 from lang3dxl_ns.query.text import Prompt, TextConfig
+from lang3dxl_ns.query.trust import Trust
 from lang3dxl_ns.rendering import Rendering
 
 EVEN = 0.5
@@ -105,6 +106,8 @@ class Question:
     """Relevancy of every Gaussian to all of these."""
     doubts: tuple[float, ...] = ()
     """Share of unrelated words that match the scene as well, one per prompt."""
+    trusts: tuple[Trust, ...] = ()
+    """How far to believe the answers, one per prompt."""
     thresholds: tuple[float, ...] = ()
     """Relevancy above which Gaussians match, one per prompt."""
     foreground_thresholds: tuple[float, ...] = ()
@@ -141,6 +144,7 @@ class Question:
             queries=self.queries.select(rows),
             everywhere=self.everywhere[rows],
             doubts=self.doubts[one],
+            trusts=self.trusts[one],
             thresholds=self.thresholds[one],
         )
 

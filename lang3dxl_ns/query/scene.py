@@ -26,14 +26,15 @@ from lang3dxl_ns.files.splat_file import write_splats
 from lang3dxl_ns.preparation.encoders import load_image_text_encoder
 from lang3dxl_ns.query import answer
 from lang3dxl_ns.query.answering import Place
-from lang3dxl_ns.query.doubt import DOUBTFUL, Doubts, doubtful
+from lang3dxl_ns.query.doubt import DOUBTFUL, Doubts, doubtful, peaks
 from lang3dxl_ns.query.engine import QueryEngine, make_engine
 from lang3dxl_ns.query.match import Found, Match, View
-from lang3dxl_ns.query.question import QueryConfig, Question, match_thresholds
+from lang3dxl_ns.query.question import QueryConfig, Question, match_thresholds, matching
 from lang3dxl_ns.query.relevancy import Queries
 from lang3dxl_ns.query.text import EncodeTexts, Prompt, TextEncoder, listed_phrases, parse_prompts, texts_of
+from lang3dxl_ns.query.trust import ANCHORS, alike, foreignness, judged
 from lang3dxl_ns.query.visibility import VisibleGaussians, measured, median_distance, total_pixels
-from lang3dxl_ns.query.vocabulary import searched, shipped_vocabulary
+from lang3dxl_ns.query.vocabulary import closest_word, common_words, searched, shipped_vocabulary
 from lang3dxl_ns.rendering import Backend, Rendering, Splats, composite
 from lang3dxl_ns.rendering.gathering import filled_pixels
 from lang3dxl_ns.scene.camera import Camera, posed, resized, with_field_of_view, with_longer_side
@@ -227,12 +228,26 @@ class Scene:
                 say_once(f"foreground {prompt.text}: {advice}")
         strict = [bool(prompt.negatives or prompt.taught) for prompt in everything]
         levels = match_thresholds(relevancy, doubts, strict)
+        fits = peaks(relevancy).tolist()
+        trusts = [
+            judged(
+                prompt.text,
+                doubts[i],
+                fits[i],
+                taught=prompt.taught is not None or prompt.vector is not None,
+                foreign=self.foreignness,
+                meant=closest_word(prompt.text, (*self.words, *common_words())),
+                alike=alike(prompt.text, self.synonyms(prompt), relevancy[i] > levels[i], self.anchors),
+            )
+            for i, prompt in enumerate(prompts)
+        ]
         return Question(
             self.engine,
             tuple(prompts),
             queries,
             relevancy,
             tuple(doubts[:count]),
+            tuple(trusts),
             levels[:count] if requested is None else (requested,) * count,
             levels[count:],
             self.config.min_alpha,
@@ -487,6 +502,8 @@ class Scene:
         for text in listed:
             if isinstance(text, Tensor | Array):
                 text = Prompt("vector", vector=self._vector(text))
+            if isinstance(text, str) and known_word(text) in self.words:
+                text = Prompt(" ".join(text.split()))
             for prompt in [text] if isinstance(text, Prompt) else parse_prompts(text):
                 word = None if prompt.vector is not None else self.words.get(known_word(prompt.text))
                 prompts.append(prompt if word is None else replace(prompt, taught=word))
@@ -549,6 +566,19 @@ class Scene:
         if self.encode_texts is None:
             self.encode_texts = text_encoder(self.file, self.device)
         return self.encode_texts(texts)
+
+    @cached_property
+    def foreignness(self) -> float | None:
+        """How far the scene is from what its CLIP was trained on, about 1 for scenes like that; see
+        `trust.foreignness`."""
+        return foreignness(self.engine, self.file.clip_identity)
+
+    @cached_property
+    def anchors(self) -> Bool[Tensor, "anchors n"]:
+        """Which Gaussians match each of the common words `trust.ANCHORS`."""
+        relevancy = self.engine.of_gaussians(self.text.plain_queries(ANCHORS).to(self.device))
+        levels = match_thresholds(relevancy, self.doubts.of(relevancy), [False] * len(ANCHORS))
+        return matching(relevancy, levels)
 
     @cached_property
     def doubts(self) -> Doubts:
