@@ -23,6 +23,7 @@ import torch
 import torch.nn.functional as F
 import tyro
 from jaxtyping import Float
+from lang3dxl_ns.preparation.photo_collection import read_collection
 from PIL import Image
 from torch import Tensor
 
@@ -40,7 +41,6 @@ from lang3dxl_ns.preparation.encoders import (
     load_dense_encoder,
     load_image_text_encoder,
 )
-from lang3dxl_ns.preparation.photo_collection import read_collection
 from lang3dxl_ns.preparation.pyramid import THIRD, build_clip_target
 from lang3dxl_ns.preparation.settings import PreparationConfig
 from lang3dxl_ns.preparation.targets import TargetReader
@@ -51,7 +51,8 @@ from lang3dxl_ns.rendering import composite
 from lang3dxl_ns.rendering.gathering import Pixels, gather
 from lang3dxl_ns.scene.camera import resized
 from lang3dxl_ns.scene.record import ScenePhoto
-from lang3dxl_ns.training.learn_codes import DENSE_AXES, sharpen
+from lang3dxl_ns.training.learn_codes import DENSE_AXES
+from lang3dxl_ns.training.sharpening import sharpen
 
 TRAINING_SEEDS = range(10_000, 20_000)
 """Landmarks of the built-in encoders' own training."""

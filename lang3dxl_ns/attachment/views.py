@@ -21,13 +21,13 @@ from lang3dxl_ns.attachment import Up
 from lang3dxl_ns.common.console import say, tracked
 from lang3dxl_ns.common.errors import DAMAGE, UserError
 from lang3dxl_ns.common.files import make_folder, read_json, write_atomically
-from lang3dxl_ns.preparation.photo_collection import PhotoCollection
 from lang3dxl_ns.query.match import as_bytes, save_picture
 from lang3dxl_ns.query.visibility import fingerprint
 from lang3dxl_ns.rendering import Rendering, Splats, composite, render
 from lang3dxl_ns.rendering.gathering import filled_pixels
 from lang3dxl_ns.rendering.projection import rotations
 from lang3dxl_ns.scene.camera import Camera, Lens, resized
+from lang3dxl_ns.scene.capture import Capture
 from lang3dxl_ns.scene.colmap import Reconstruction, TrackedPhoto
 from lang3dxl_ns.scene.photo import Photo
 
@@ -132,7 +132,7 @@ def _axis(name: str) -> Float[Tensor, "3"]:
     return axis
 
 
-def rendered_views(splats: Splats, count: int, up: Up, folder: Path) -> PhotoCollection:
+def rendered_views(splats: Splats, count: int, up: Up, folder: Path) -> Capture:
     """Render this many pictures of a splat as a photo collection, in the splat's frame. They are kept in
     `folder`, and rendered again only for another splat or other settings. Raises UserError if no view shows
     the splat well."""
@@ -157,7 +157,7 @@ def rendered_views(splats: Splats, count: int, up: Up, folder: Path) -> PhotoCol
     photos = [Photo(name, folder / "images" / name, None, LENS) for name in names]
     points = np.concatenate([photo.points for photo in seen.values()])
     reconstruction = Reconstruction(seen, points, np.zeros(points.shape, np.uint8))
-    return PhotoCollection(folder, photos, reconstruction, {})
+    return Capture(folder, photos, reconstruction, {})
 
 
 def _kept(folder: Path, stamp: str) -> list[Camera] | None:

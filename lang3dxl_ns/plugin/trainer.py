@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
+from statistics import median
 from time import perf_counter
 from types import FrameType
 from typing import Any, Literal
@@ -210,8 +211,7 @@ class Lang3DXLTrainer(Trainer):
         """Check that a checkpoint's photos are this run's. Raises UserError for another frame, and, if the
         cameras were `corrected` one by one, for other training photos."""
         data = self.pipeline.datamanager
-        new = data.train_dataparser_outputs
-        if not before.has_frame(new.dataparser_transform, new.dataparser_scale):
+        if not before.has_frame(data.frame.transform, data.frame.scale):
             raise UserError(f"{path} is of other photos, or of another reconstruction of them: train anew")
         splits = [{p.name: p.split for p in file.photos} for file in (before, data.scene_file())]
         trained = [[name for name, split in known.items() if split == "train"] for known in splits]
@@ -306,16 +306,19 @@ class Lang3DXLTrainer(Trainer):
     @torch.no_grad()
     def _announce_time(self) -> None:
         """Log how long training and learning words will take with the present Gaussians. The estimate comes
-        from rendering a photo's view for the second time, since the first may compile kernels."""
+        from the median of five renderings of a photo's view, since the first may compile kernels, and others
+        may wait for another program."""
         model, cameras = self.pipeline.model, self.pipeline.datamanager.train_dataset.cameras
         middle = int((cameras.width * cameras.height).flatten().argsort()[len(cameras) // 2])
         with self.train_lock:  # the viewer may render at the same time
             model.eval()
-            for _ in range(2):
+            times = []
+            for _ in range(5):
                 start = perf_counter()
                 model.get_outputs(cameras[middle : middle + 1])
                 synchronize()
-            rendering = perf_counter() - start
+                times.append(perf_counter() - start)
+            rendering = median(times)
             model.train()
         count, decoder = self.config.max_num_iterations, model.semantic_field
         seconds, words = rendering * count * RENDERINGS_PER_STEP[model.learns_from_renderings], 0.0

@@ -27,7 +27,8 @@ from lang3dxl_ns.preparation.encoders import load_image_text_encoder
 from lang3dxl_ns.query.doubt import DOUBTFUL, Doubts, doubtful
 from lang3dxl_ns.query.engine import QueryEngine, make_engine
 from lang3dxl_ns.query.match import Found, Match, View
-from lang3dxl_ns.query.question import QueryConfig, Question, match_thresholds
+from lang3dxl_ns.query.negatives import CLEAR, NOTHING
+from lang3dxl_ns.query.question import QueryConfig, Question
 from lang3dxl_ns.query.relevancy import Queries
 from lang3dxl_ns.query.text import (
     EncodeTexts,
@@ -38,9 +39,10 @@ from lang3dxl_ns.query.text import (
     taught_prompt,
     texts_of,
 )
+from lang3dxl_ns.query.thresholds import match_thresholds
 from lang3dxl_ns.query.view_ranking import Viewpoint, rank_views, strongest_match
 from lang3dxl_ns.query.visibility import VisibleGaussians, fingerprint, load_visible, save_visible, spread
-from lang3dxl_ns.query.vocabulary import CLEAR, NOTHING, searched, shipped_vocabulary
+from lang3dxl_ns.query.vocabulary import searched, shipped_vocabulary
 from lang3dxl_ns.rendering import Backend, Rendering, Splats, composite
 from lang3dxl_ns.rendering.gathering import filled_pixels
 from lang3dxl_ns.scene.camera import Camera, posed, resized, with_field_of_view, with_longer_side

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from box_splat import box_splat
+from lang3dxl_ns.preparation.photo_collection import read_collection
 from moved_splats import transformed, with_colors
 from scenes import write_scene
 
@@ -21,7 +22,6 @@ from lang3dxl_ns.files.read_splats import read_splats
 from lang3dxl_ns.files.scene_file import read_scene
 from lang3dxl_ns.files.scene_file import write_scene as write_scene_file
 from lang3dxl_ns.files.splat_file import write_splats
-from lang3dxl_ns.preparation.photo_collection import read_collection
 from lang3dxl_ns.words.taught_words import Example
 
 SETTINGS = AttachConfig(views=6, up="z", clip="builtin", dense="builtin", dense_tokens=16)

@@ -5,12 +5,12 @@ import math
 import os
 
 import pytest
+from lang3dxl_ns.preparation.photo_collection import read_collection
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from PIL import Image
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.plugin.nerfstudio_scenes import check_transforms
-from lang3dxl_ns.preparation.photo_collection import read_collection
 
 POSE = [[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 2], [0, 0, 0, 1]]
 

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from lang3dxl_ns.training import learn_codes
-from lang3dxl_ns.training.learn_codes import sharpen
+from lang3dxl_ns.training.sharpening import sharpen
 
 
 def scene(count=3000, seed=0, kinds=4):

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import scenes
+from lang3dxl_ns.preparation.photo_collection import images_path
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from PIL import Image
 from scenes import speckled, write_scene
@@ -16,7 +17,6 @@ from scenes import speckled, write_scene
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.plugin.datamanager import Lang3DXLDataManagerConfig
 from lang3dxl_ns.plugin.dataparser import PhotoCollectionDataParserConfig, parser_for
-from lang3dxl_ns.preparation.photo_collection import images_path
 from lang3dxl_ns.scene.photo_folder import _sharpest, extract_frames
 
 needs_ffmpeg = pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="ffmpeg is not installed")

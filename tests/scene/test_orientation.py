@@ -6,9 +6,9 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from lang3dxl_ns.preparation.photo_collection import read_transforms
 from PIL import Image, ImageOps
 
-from lang3dxl_ns.preparation.photo_collection import read_transforms
 from lang3dxl_ns.scene.camera import Lens
 from lang3dxl_ns.scene.colmap import TrackedPhoto
 from lang3dxl_ns.scene.photo import Photo, stored_size, turned_lens, upright, upright_in_model
