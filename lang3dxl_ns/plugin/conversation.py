@@ -14,13 +14,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lang3dxl_ns.query.doubt import doubtful
 from lang3dxl_ns.query.match import Found
 from lang3dxl_ns.query.question import QueryConfig, Question, pictures
 from lang3dxl_ns.query.scene import Scene, text_encoder
 from lang3dxl_ns.query.text import EncodeTexts, caution
 from lang3dxl_ns.rendering import Rendering
 from lang3dxl_ns.scene.record import SceneRecord
+from lang3dxl_ns.training.learn_codes import forget_words
 
 _LONGEST = 40
 """Most characters of a prompt in the summary."""
@@ -122,7 +122,7 @@ class Conversation:
                 return scene, step if learning else None
             finally:
                 if learning:
-                    self.model.forget_gathered_codes()
+                    forget_words(self.model.run)
                 self.model.train(training)
 
     # ── answering: called by the render thread, which holds the lock ────────────────────────────────
@@ -164,7 +164,7 @@ class Conversation:
             where = f"{count} good views, best {best:.2f}" if count else "nothing in the scene looks like it"
             lines.append(f"**{plain(text)}**: {where}")
             taught = found.prompt.taught is not None
-            warnings = (None if taught else caution(text), doubtful(text, found.doubt, taught))
+            warnings = (None if taught else caution(text), str(found.trust))
             lines += [plain(line) for line in warnings if line]
         return "  \n".join(lines)
 

@@ -107,10 +107,12 @@ def photos_below(folder: Path) -> list[str]:
 
 
 def files_below(folder: Path) -> Iterator[str]:
-    """Yield all files in a folder and its sub-folders, without hidden ones and the cache."""
+    """Yield all regular files in a folder and its sub-folders, without hidden ones and the cache."""
     for parent, folders, files in os.walk(folder):
         folders[:] = [f for f in folders if f != "lang3dxl_cache" and not f.startswith(".")]
-        yield from (Path(parent, file).relative_to(folder).as_posix() for file in files if file[0] != ".")
+        for path in (Path(parent, file) for file in files if not file.startswith(".")):
+            if path.is_file():
+                yield path.relative_to(folder).as_posix()
 
 
 def _size_and_lens(path: Path) -> tuple[tuple[int, int], tuple | None]:

@@ -74,6 +74,8 @@ class PageServer(ThreadingHTTPServer):
             return HTTPStatus.OK, _KINDS["json"], json.dumps(answer).encode()
         if place.path == "/api/look":
             return HTTPStatus.OK, _BYTES, self.page.colors(values.get("photo", ""))
+        if place.path == "/api/floaters":
+            return HTTPStatus.OK, _BYTES, self.page.floaters()
         if place.path == "/api/photo":
             return HTTPStatus.OK, "image/jpeg", self.page.photo(values.get("name", ""))
         name = place.path.removeprefix("/") or "index.html"

@@ -82,6 +82,8 @@ class Page:
     """Training photo whose lighting is shown; default: the overview photo."""
     photos: Path | None = None
     """Folder of the photos, of which the page shows small copies; if None, it shows their cameras alone."""
+    hide_floaters: bool = False
+    """Whether the page opens with floaters hidden."""
     live: bool = False
     """Whether a server encodes any other text (`answer`)."""
     own_words: PageWords = field(default_factory=PageWords)
@@ -127,6 +129,9 @@ class Page:
             "words": None,
         }
         files |= self._photos(about)
+        about["floaters"], about["hide"] = "api/floaters" if self.live else "floaters.bin", self.hide_floaters
+        if not self.live:
+            files["floaters.bin"] = self.floaters()
         about["looks"] = {name: f"api/look?photo={quote(name)}" for name in self._looks}
         if not self.live:  # without a server the lightings are files, read when they are chosen
             chosen = self._within_limits("lightings", self._looks, [4 * len(scene.splats)] * len(self._looks))
@@ -252,6 +257,10 @@ class Page:
         if self.photos is None:
             raise UserError("the photos are not at hand: name their folder with --photos")
         return small_photo(self.scene.file.photo(name), self.photos)
+
+    def floaters(self) -> bytes:
+        """Compute how surely each Gaussian is a floater, a byte each."""
+        return (self.scene.floating * 255).round().byte().cpu().numpy().tobytes()
 
     def colors(self, photo: str) -> bytes:
         """Compute every Gaussian's color and opacity in a photo's look. Raises UserError if there is none."""
