@@ -26,14 +26,6 @@ def test_a_scene_file_knows_what_its_words_are_searched_as():
     assert {searched(word) for word in shipped_vocabulary()} <= set(common_words())
 
 
-@pytest.mark.parametrize(
-    ("typed", "hint"), [("door not gate", '"door" not "gate"'), ('"windows" not', '"windows" not "…"')]
-)
-def test_a_not_that_tells_nothing_apart_is_explained(typed, hint):
-    (prompt,) = parse_prompts(typed)
-    assert not prompt.negatives and hint in caution(prompt.text)
-
-
 def test_a_prompt_longer_than_clip_reads_is_said_to_be():
     assert "the rest of this prompt is ignored" in caution("sky " * 60 + "rose window")
     assert caution("a tower with four clocks and a bell") is None
