@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import shlex
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from typing import Annotated, Any
 
@@ -23,11 +23,11 @@ from lang3dxl_ns.common.settings_help import showing
 from lang3dxl_ns.files.scene_file import Provenance, check_scene_name, replace_scene
 from lang3dxl_ns.files.splat_file import check_splat_name
 from lang3dxl_ns.open_scene import load_scene, provenance_of
-from lang3dxl_ns.query.doubt import doubtful
 from lang3dxl_ns.query.match import save_picture, together
 from lang3dxl_ns.query.question import QueryConfig, Question
 from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.query.text import Prompt, caution, listed_phrases, parse_prompts
+from lang3dxl_ns.query.trust import Trust
 from lang3dxl_ns.query.vocabulary import whole_words
 from lang3dxl_ns.scene.camera import Camera
 from lang3dxl_ns.scene.camera_path import read_camera_path
@@ -119,15 +119,16 @@ class Query:
             views.append({"view": name, **seconds, "matches": found})
         if self.coco is not None:
             write_atomically(self.coco, json.dumps(labels.content) + "\n")
-        texts = list(zip(prompts, question.doubts, question.thresholds, folders, strict=True))
-        report = {"texts": [_text_report(scene, *text) for text in texts], "views": views}
+        texts = list(zip(prompts, question.trusts, question.thresholds, folders, strict=True))
+        reports = zip(question.doubts, texts, strict=True)
+        report = {"texts": [_text_report(scene, d, *text) for d, text in reports], "views": views}
         write_atomically(listed, json.dumps(report, indent=2, ensure_ascii=False) + "\n")
-        for (prompt, doubt, _, folder), (matches_there, score, where) in zip(texts, best, strict=True):
+        for (prompt, trust, _, folder), (matches_there, score, where) in zip(texts, best, strict=True):
             taught = prompt.taught is not None
             closest = "" if matches_there else " (no match; this view comes closest)"
             say(f"{prompt.text}{' (taught)' if taught else ''}: {score:.2f} at {where}; {folder}{closest}")
-            warnings = (None if taught else caution(prompt.text), doubtful(prompt.text, doubt, taught))
-            say(*(f"  {advice}" for advice in warnings if advice))
+            advice = None if taught else caution(prompt.text)
+            say(*(f"  {line}" for line in (advice, str(trust)) if line))
         ours = [*self.out.glob("*/*.npy"), *shared.glob("*.png")]  # a user may have other folders there
         if old := sorted({path.parent.name for path in ours if path.lstat().st_mtime_ns <= before}):
             say(f"{self.out} still has files of an earlier query, not listed in query.json: {some(old)}")
@@ -209,10 +210,13 @@ def file_names(photos: list[str]) -> list[str]:
     return [n if names.count(n) == 1 else f"{n}-{i + 1}" for i, n in enumerate(names)]
 
 
-def _text_report(scene: Scene, prompt: Prompt, doubt: float, threshold: float, folder: Path) -> dict:
+def _text_report(
+    scene: Scene, doubt: float, prompt: Prompt, trust: Trust, threshold: float, folder: Path
+) -> dict[str, Any]:
     taught, synonyms = prompt.taught is not None, scene.synonyms(prompt)
     told = {"text": prompt.text, "negatives": list(prompt.negatives), "synonyms": synonyms, "taught": taught}
-    return told | {"doubt": doubt, "threshold": threshold, "folder": folder.name}
+    told |= {"doubt": doubt, "trust": asdict(trust)}
+    return told | {"threshold": threshold, "folder": folder.name}
 
 
 @showing(

@@ -14,7 +14,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lang3dxl_ns.query.doubt import doubtful
 from lang3dxl_ns.query.match import Found
 from lang3dxl_ns.query.question import QueryConfig, Question, pictures
 from lang3dxl_ns.query.scene import Scene, text_encoder
@@ -164,7 +163,7 @@ class Conversation:
             where = f"{count} good views, best {best:.2f}" if count else "nothing in the scene looks like it"
             lines.append(f"**{plain(text)}**: {where}")
             taught = found.prompt.taught is not None
-            warnings = (None if taught else caution(text), doubtful(text, found.doubt, taught))
+            warnings = (None if taught else caution(text), str(found.trust))
             lines += [plain(line) for line in warnings if line]
         return "  \n".join(lines)
 
