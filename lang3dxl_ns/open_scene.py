@@ -10,7 +10,7 @@ from pathlib import Path
 import torch
 
 from lang3dxl_ns.common.console import silence_libraries
-from lang3dxl_ns.common.device import best_device
+from lang3dxl_ns.common.device import known_device
 from lang3dxl_ns.common.errors import NO_NERFSTUDIO, UserError, misses_nerfstudio
 from lang3dxl_ns.common.files import expanded
 from lang3dxl_ns.files.runs import OUTPUTS, find_config
@@ -44,7 +44,7 @@ def load_scene(
         encode_texts = None
         if clip is not None:
             about = replace(describe_scene_file(file)["scene"], clip=clip)
-            encode_texts = text_encoder(about, device or best_device())
+            encode_texts = text_encoder(about, known_device(device))
         return read_scene(file, device, settings, encode_texts)
     silence_libraries()  # nerfstudio's imports print warnings that a user can do nothing about
     with _nerfstudio():

@@ -54,8 +54,8 @@ class Stages:
         self._current = None
 
     def progress(self, done: float) -> None:
-        """Say about how long everything that is left takes at the pace of the last minute, once that is known
-        and at every tenth of the stage. `done` is the fraction of the stage that this command does."""
+        """Say about how long everything that is left takes at the pace of the last minute, once that is
+        known, and at every tenth of the stage. `done` is the fraction of the stage in this command."""
         now = time.perf_counter()
         self._recent.append((now, done))
         while len(self._recent) > 2 and now - self._recent[1][0] > _WINDOW_S:
