@@ -1,4 +1,4 @@
-"""True things of a landmark: windows, portals, domes, towers, spires and minarets, and the photos that show each."""
+"""True things of a landmark, such as its windows, portals and towers, and the photos that show each."""
 
 from __future__ import annotations
 
