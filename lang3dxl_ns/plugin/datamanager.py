@@ -42,7 +42,7 @@ from lang3dxl_ns.plugin.nerfstudio_scenes import photos_of, reconstruction_of
 from lang3dxl_ns.plugin.photo_dataset import EvalPhotos, PhotoDataset
 from lang3dxl_ns.preparation.encoders import usual_dense
 from lang3dxl_ns.preparation.foreground import foreground_kind, with_foreground
-from lang3dxl_ns.preparation.model_files import CLIP_OPTION, find_model
+from lang3dxl_ns.preparation.model_files import CLIP_OPTION, find_model, usual_clip
 from lang3dxl_ns.preparation.needs import Need, needs_table, scene_needs
 from lang3dxl_ns.preparation.photo_cache import PhotoCache, has_vanished
 from lang3dxl_ns.preparation.physical_scale import CropPlan, plan_crops
@@ -94,6 +94,7 @@ class Lang3DXLDataManagerConfig(PreparationConfig, FullImageDatamanagerConfig):
     def settle_targets(self, learned: bool, gathered: bool) -> None:
         """Resolve what is prepared: semantics `learned` with the scene use regions and targets in every step;
         features `gathered` onto Gaussians, also those that codes start from, need fine crops."""
+        self.clip = usual_clip(self.clip)
         self.targets_in_steps = learned
         if self.crops == "auto":
             self.crops = "fine" if gathered else "pyramid"
@@ -228,7 +229,8 @@ class Lang3DXLDataManager(FullImageDatamanager):
         used += [foreground_kind(c)] if c.foreground == "text" else []
         used += [REGIONS] if self._region_source is not None else []
         names = [photo.name for d in (self.train_dataset, self.eval_dataset) for photo in d.photos]
-        return FeatureStore(self.cache_dir).clean(used, names)
+        shared = self.config.cache_dir is not None
+        return FeatureStore(self.cache_dir).clean(used, names, shared)
 
     @cached_property
     def crop_plan(self) -> CropPlan:
@@ -271,11 +273,11 @@ class Lang3DXLDataManager(FullImageDatamanager):
         return SceneRecord(
             photos=[*trained, *(photo for photo in held_out if photo.name not in names)],
             clip=None if known is None else known.address,
-            clip_identity=None if known is None else known.identity,
+            clip_identity=None if known is None else known.clip_identity,
             scale=frame.scale,
             transform=frame.transform.tolist(),
             data=str(expanded(self.data_folder).absolute()),
-        )
+        ).located(self.photos.values())
 
     def _described(
         self, dataset: PhotoDataset, split: Literal["train", "eval"], poses: Tensor | None = None
