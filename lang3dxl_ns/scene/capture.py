@@ -362,8 +362,8 @@ def _mention_what_is_not_used(capture: Capture, model: Path, listed: set[str]) -
 
         say(
             f"{capture.folder} has {len(others) + 1} models; used is {counted(model)} photos. There are also "
-            f"{', '.join(map(counted, others))}: choose with `lang3dxl-colmap --colmap-path FOLDER` after all "
-            "other options"
+            f"{', '.join(map(counted, others))}: choose with `lang3dxl-colmap --colmap-path FOLDER` after "
+            "all other options"
         )
     unknown = [name for name in photos_below(capture.images) if name not in listed]
     if unknown:
