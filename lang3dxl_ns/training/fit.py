@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import signal
 import threading
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -18,12 +19,15 @@ from torch.optim.lr_scheduler import LambdaLR
 from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.device import best_device
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.files import expanded
 from lang3dxl_ns.common.stages import Stages
 from lang3dxl_ns.files.scene_file import SUFFIX, Provenance, replace_scene
+from lang3dxl_ns.preparation.model_files import check_encoders
 from lang3dxl_ns.preparation.needs import needs_table
 from lang3dxl_ns.preparation.settings import PreparationConfig
 from lang3dxl_ns.query.scene import Scene
-from lang3dxl_ns.scene.capture import Capture
+from lang3dxl_ns.scene.capture import Capture, open_capture, say_left_out
+from lang3dxl_ns.scene.photo_folder import check_data
 from lang3dxl_ns.training.batches import TrainingData
 from lang3dxl_ns.training.checkpoint import CHECKPOINT, read_checkpoint, save_checkpoint
 from lang3dxl_ns.training.learn_codes import forget_words, learn_words
@@ -203,6 +207,8 @@ def fit(capture: Capture, settings: Settings, out: Path, cache_dir: Path, device
         UserError: the photos or settings cannot be used, or the folder's run is another one.
         KeyboardInterrupt: Ctrl-C or SIGTERM stopped the run, after a checkpoint.
     """
+    # A group without gradients so far has a schedule all the same.
+    warnings.filterwarnings("ignore", "Detected call of .lr_scheduler.step")
     settings.resolve()
     out.mkdir(parents=True, exist_ok=True)
     stages = Stages({"prepare": 0.3, "train": 0.6, "words": 0.1})
@@ -252,37 +258,54 @@ def _stoppable() -> Iterator[threading.Event]:
             signal.signal(number, handler)
 
 
+def run_folder(
+    data: str | Path,
+    out: str | Path | None,
+    settings: Settings,
+    cache_dir: Path | None = None,
+    restart: bool = False,
+) -> tuple[Path, Scene]:
+    """Open the capture in a folder, and train it as `fit`; return the folder of the run, by default
+    outputs/NAME, and the scene. `restart` forgets the folder's run. Raises as `fit`."""
+    check_data(expanded(data))
+    check_encoders(settings.targets.clip, settings.targets.dense)
+    capture = open_capture(data, cache_dir=cache_dir)
+    say_left_out(capture)
+    folder = Path("outputs") / (capture.folder.name or "scene") if out is None else expanded(out)
+    if restart:
+        (folder / CHECKPOINT).unlink(missing_ok=True)
+    cache = expanded(cache_dir or capture.folder / "lang3dxl_cache")
+    return folder, fit(capture, settings, folder, cache)
+
+
 def train(
     data: str | Path,
     out: str | Path | None = None,
     *,
-    method: Method = "lang3dxl",
     steps: int | None = None,
+    method: Method = "lang3dxl",
     **settings: Any,
 ) -> Scene:
-    """Train a scene from photos, or go on with a run that was stopped.
+    """Train a scene from photos, or go on with a run that was stopped, and return it.
 
     Args:
         data: folder of photos, with or without a COLMAP model or transforms.json, or a video.
         out: folder of the run, in which NAME.scene is written; by default outputs/NAME.
-        method: `lang3dxl`, or `lang3dxl-paper` as printed.
         steps: iterations; by default 30,000 (70,000 as printed) on a GPU and 3,000 without one.
+        method: `lang3dxl`, or `lang3dxl-paper` as printed.
         **settings: settings of `TrainingSettings`, `PreparationConfig` and `Settings` by name, such as
             clip="builtin".
 
     Raises:
-        UserError: the photos or settings cannot be used.
+        UserError: the photos or settings cannot be used, or training was interrupted.
     """
-    from lang3dxl_ns.common.files import expanded
-    from lang3dxl_ns.scene.capture import open_capture, say_left_out
-
     chosen = Settings.of(method, steps)
     for name, value in settings.items():
         owner = next((o for o in (chosen.scene, chosen.targets, chosen) if hasattr(o, name)), None)
         if owner is None:
-            raise UserError(f"there is no setting {name}: see `lang3dxl train --help`")
+            raise UserError(f"there is no setting {name}: see lang3dxl train --help-all")
         setattr(owner, name, value)
-    capture = open_capture(data)
-    say_left_out(capture)
-    folder = Path("outputs") / (capture.folder.name or "scene") if out is None else expanded(out)
-    return fit(capture, chosen, folder, capture.folder / "lang3dxl_cache")
+    try:
+        return run_folder(data, out, chosen)[1]
+    except KeyboardInterrupt as error:
+        raise UserError("training was stopped; to resume: the same call") from error

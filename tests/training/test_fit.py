@@ -51,7 +51,9 @@ def differing(first: dict, second: dict) -> list[str]:
         name
         for name, value in first.items()
         if isinstance(value, torch.Tensor)
-        and not (value.shape == second[name].shape and torch.equal(value.nan_to_num(), second[name].nan_to_num()))
+        and not (
+            value.shape == second[name].shape and torch.equal(value.nan_to_num(), second[name].nan_to_num())
+        )
     ]
 
 
@@ -86,7 +88,9 @@ def test_a_run_that_was_stopped_ends_with_the_same_bytes(data, settings, tmp_pat
     assert differing(whole, trained(data, tmp_path / "again", settings())) == []
 
 
-def test_a_finished_run_is_not_trained_again_and_another_one_is_refused(data, settings, tmp_path, monkeypatch):
+def test_a_finished_run_is_not_trained_again_and_another_one_is_refused(
+    data, settings, tmp_path, monkeypatch
+):
     trained(data, tmp_path, settings(4))
     monkeypatch.setattr(fitting, "render", lambda *_: pytest.fail("trained again"))
     monkeypatch.setattr(fitting, "learn_words", lambda *_: pytest.fail("learned again"))
