@@ -20,6 +20,8 @@ from lang3dxl_ns.open_scene import load_scene
 from lang3dxl_ns.training import gaussians
 from lang3dxl_ns.training.step import decoded_side
 
+pytestmark = pytest.mark.nerfstudio
+
 EVERYTHING = {
     "pipeline__model__decoder__name": "paper",
     "pipeline__model__densify_grad_thresh": 1e-7,

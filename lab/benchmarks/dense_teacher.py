@@ -51,7 +51,8 @@ from lang3dxl_ns.rendering.gathering import Pixels, gather
 from lang3dxl_ns.scene.camera import resized
 from lang3dxl_ns.scene.capture import open_capture
 from lang3dxl_ns.scene.record import ScenePhoto
-from lang3dxl_ns.training.learn_codes import DENSE_AXES, sharpen
+from lang3dxl_ns.training.learn_codes import DENSE_AXES
+from lang3dxl_ns.training.sharpening import sharpen
 
 TRAINING_SEEDS = range(10_000, 20_000)
 """Landmarks of the built-in encoders' own training."""

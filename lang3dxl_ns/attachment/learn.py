@@ -19,6 +19,7 @@ from lang3dxl_ns.components.feature_decoder import Decoder
 from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
 from lang3dxl_ns.preparation.encoders import CLIP_OPTION, find_model, usual_dense
 from lang3dxl_ns.preparation.foreground import with_foreground
+from lang3dxl_ns.preparation.model_files import usual_clip
 from lang3dxl_ns.preparation.physical_scale import plan_crops
 from lang3dxl_ns.preparation.prepare import prepare
 from lang3dxl_ns.preparation.settings import PreparationConfig
@@ -36,7 +37,8 @@ LONGER_SIDE = 800
 
 
 def settled(config: PreparationConfig) -> PreparationConfig:
-    """Return the settings for gathering features: fine crops, and the dense encoder that the CLIP needs."""
+    """Return the settings for gathering features: fine crops, the CLIP at hand, and its dense encoder."""
+    config = replace(config, clip=usual_clip(config.clip))
     return replace(config, dense=usual_dense(config, False), regions="none", crops="fine")
 
 
@@ -103,8 +105,8 @@ def scene_file(
     return SceneRecord(
         photos=photos,
         clip=known.address,
-        clip_identity=known.identity,
+        clip_identity=known.clip_identity,
         scale=scale,
         transform=(similarity[:3] / scale).tolist(),
         data=str(collection.folder),
-    )
+    ).located(collection.photos)

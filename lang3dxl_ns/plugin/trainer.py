@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
+from statistics import median
 from time import perf_counter
 from types import FrameType
 from typing import Any, Literal
@@ -27,7 +28,7 @@ from torch.cuda.amp.grad_scaler import GradScaler
 
 from lang3dxl_ns.common.console import say, some
 from lang3dxl_ns.common.device import multiplies_bfloat16
-from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.errors import UserError, not_of_memory
 from lang3dxl_ns.common.files import expanded, replace_durably
 from lang3dxl_ns.common.memory import ran_out_of_memory
 from lang3dxl_ns.common.reports import synchronize
@@ -201,6 +202,7 @@ class Lang3DXLTrainer(Trainer):
                 self.grad_scaler.load_state_dict(state["scalers"])
             self._run_state, self.words_are_learned = state["run"], state["words"]
         except NOT_A_CHECKPOINT as error:
+            not_of_memory(error)
             raise UserError(
                 f"{path} is not a checkpoint of lang3dxl ({error}): give --load-dir the "
                 "nerfstudio_models folder of a run, or --load-checkpoint one of its step-….ckpt files"
@@ -263,6 +265,11 @@ class Lang3DXLTrainer(Trainer):
         beyond = self._start_step - self.config.max_num_iterations
         return beyond > 0 or (beyond == 0 and words)
 
+    @property
+    def has_final_words(self) -> bool:
+        """Whether the words of the run's end are learned: from then on the model stays as it is."""
+        return self._is_ending and self.words_are_learned
+
     def train(self) -> None:
         """Train up to `max_num_iterations` in total (nerfstudio would add that many to a resumed run), then
         learn words. A run that was stopped between the two learns words only. Raises SystemExit after a
@@ -306,16 +313,19 @@ class Lang3DXLTrainer(Trainer):
     @torch.no_grad()
     def _announce_time(self) -> None:
         """Log how long training and learning words will take with the present Gaussians. The estimate comes
-        from rendering a photo's view for the second time, since the first may compile kernels."""
+        from the median of five renderings of a photo's view, since the first may compile kernels, and others
+        may wait for another program."""
         model, cameras = self.pipeline.model, self.pipeline.datamanager.train_dataset.cameras
         middle = int((cameras.width * cameras.height).flatten().argsort()[len(cameras) // 2])
         with self.train_lock:  # the viewer may render at the same time
             model.eval()
-            for _ in range(2):
+            times = []
+            for _ in range(5):
                 start = perf_counter()
                 model.get_outputs(cameras[middle : middle + 1])
                 synchronize()
-            rendering = perf_counter() - start
+                times.append(perf_counter() - start)
+            rendering = median(times)
             model.train()
         count, decoder = self.config.max_num_iterations, model.semantic_field
         seconds, words = rendering * count * RENDERINGS_PER_STEP[model.run.learns_from_renderings], 0.0

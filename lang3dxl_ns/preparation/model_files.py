@@ -6,6 +6,8 @@ Code that comes with a model is never run, and weights are read as plain tensors
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
 from functools import lru_cache, partial
@@ -22,12 +24,16 @@ DENSE_OPTION = "--pipeline.datamanager.dense"
 
 BUILTIN = "builtin"
 """Name of the small encoders that ship with this package."""
+USUAL_CLIP = "openai/clip-vit-base-patch32"
+"""CLIP that "auto" chooses where it was downloaded before."""
 _PREFIX = "--pipeline.datamanager."
 option_prefix: ContextVar[str] = ContextVar("option_prefix", default=_PREFIX)
 """Prefix of the options in the current command; `lang3dxl prepare` has none."""
 _DEMO = Path(__file__).parents[1] / "demo"
 _BUILTIN_FOLDERS = {CLIP_OPTION: _DEMO / "clip", DENSE_OPTION: _DEMO / "dense"}
 _WEIGHTS = ("model*.safetensors", "pytorch_model*.bin")  # the first that exists is used
+_TOKENIZER = ("tokenizer.json", "vocab.json", "merges.txt", "*.model")
+"""Files that decide how a text becomes tokens."""
 _FILES = ("*.json", "*.txt", "*.model")
 """Patterns of configuration, vocabularies, and SentencePiece models."""
 _MOST_LAYERS = 1000
@@ -44,6 +50,14 @@ class ModelFiles:
     """Fingerprint of configuration and weights, not of the name, so targets stay valid if the model moves."""
     option: str
     """Command-line option that chose the model, for messages."""
+
+    @property
+    def clip_identity(self) -> str:
+        """Fingerprint of a CLIP: `identity` and, after a dot, that of its tokenizer, on which the vectors of
+        texts depend but no target does."""
+        files = sorted(path for name in _TOKENIZER for path in self.folder.glob(name))
+        digests = [_digest(path, path.stat().st_size, path.stat().st_mtime_ns) for path in files]
+        return f"{self.identity}.{hashlib.sha256(''.join(digests).encode()).hexdigest()[:16]}"
 
     @property
     def address(self) -> str:
@@ -63,6 +77,17 @@ def find_model(name_or_dir: str | Path, option: str) -> ModelFiles:
     else:
         folder = local if local.is_dir() else _download(name, option)
     return ModelFiles(name, folder, _fingerprint(folder, option), option)
+
+
+def usual_clip(clip: str) -> str:
+    """Resolve the image-text encoder "auto": OpenAI's CLIP if it is in the Hugging Face cache, otherwise the
+    built-in one, so that nothing is downloaded unasked. Another name is returned as it is."""
+    from huggingface_hub import try_to_load_from_cache
+
+    if clip != "auto":
+        return clip
+    files = (try_to_load_from_cache(USUAL_CLIP, n) for n in ("model.safetensors", "pytorch_model.bin"))
+    return USUAL_CLIP if any(isinstance(file, str) for file in files) else BUILTIN
 
 
 class _NotDownloaded(UserError):
@@ -97,6 +122,16 @@ def check_encoders(clip: str, dense: str) -> None:
 def spoken(option: str) -> str:
     """Return an option as spelled in the current command."""
     return option.replace(_PREFIX, option_prefix.get())
+
+
+@contextmanager
+def short_options() -> Iterator[None]:
+    """Spell options in messages without their prefix in `ns-train`, until the block or function ends."""
+    token = option_prefix.set("--")
+    try:
+        yield
+    finally:
+        option_prefix.reset(token)
 
 
 def load_weights(model_class: Any, files: ModelFiles, device: torch.device | str) -> Any:

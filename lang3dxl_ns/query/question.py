@@ -6,8 +6,7 @@ restriction to a foreground are therefore decided here and nowhere else.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import torch
@@ -18,20 +17,16 @@ from torch import Tensor
 from lang3dxl_ns.common.checks import check_numbers
 from lang3dxl_ns.common.image import resize_nearest
 from lang3dxl_ns.common.settings_help import showing
-from lang3dxl_ns.query.doubt import DOUBTFUL, peaks
 from lang3dxl_ns.query.engine import QueryEngine
 from lang3dxl_ns.query.heat_maps import overlay, strongest
 from lang3dxl_ns.query.relevancy import TEMPERATURE, Queries
 from lang3dxl_ns.query.text import Prompt, TextConfig
+from lang3dxl_ns.query.thresholds import matching
+from lang3dxl_ns.query.trust import Trust
 from lang3dxl_ns.rendering import Rendering
 
-EVEN = 0.5
-"""Relevancy where prompt and negatives match equally well."""
-SHARE = 0.3
-"""Where matches begin, as a fraction of the way from the median Gaussian's relevancy to a prompt's peak.
-Tuned on the validation landmarks (docs/lab/words.md)."""
 COVERED = 0.3
-"""Share of a pixel that matching Gaussians must cover; under half, as most are small and edges blend."""
+"""Share of a pixel that matching Gaussians must cover; below 0.5, because most are small and edges blend."""
 _BOUNDS = {
     "temperature": (1e-3, 1e4),
     "threshold": (0, 1),
@@ -57,8 +52,8 @@ class QueryConfig:
     min_alpha: float = 0.3
     """Coverage below which a pixel cannot match."""
     foreground: str = ""
-    """Restrict matches in views without a mask to what this prompt finds, such as `building`. The view of a
-    photo with a foreground mask is always restricted to that mask."""
+    """Restrict matches to what this prompt finds, such as `building`. The view of a photo with a foreground
+    mask is restricted to that mask as well."""
     size: int | None = None
     """Longer side of pictures in pixels. Default: the photo's own, at most 1920."""
     views: int = 100
@@ -69,28 +64,6 @@ class QueryConfig:
     def __post_init__(self) -> None:
         """Raise UserError if an option is invalid."""
         check_numbers(self, _BOUNDS)
-
-
-def match_thresholds(
-    relevancy: Float[Tensor, "q n"], doubts: Sequence[float], named: Sequence[bool]
-) -> tuple[float, ...]:
-    """Compute for each prompt the relevancy above which Gaussians match.
-
-    Small and thin things blur with their surroundings in CLIP's crops, and seldom beat every negative there.
-    So the threshold is relative to the scene, and never above `EVEN`. Doubtful prompts use `EVEN`, because
-    their peaks carry no information. So do the `named` ones, which have negatives of their own to beat.
-    """
-    if relevancy.shape[1] == 0:
-        return (EVEN,) * len(relevancy)
-    low = relevancy.median(dim=1).values
-    levels = (low + SHARE * (peaks(relevancy) - low)).clamp_max(EVEN).tolist()
-    strict = [doubt > DOUBTFUL or names for doubt, names in zip(doubts, named, strict=True)]
-    return tuple(EVEN if one else level for one, level in zip(strict, levels, strict=True))
-
-
-def matching(maps: Float[Tensor, "q ..."], thresholds: Sequence[float]) -> Bool[Tensor, "q ..."]:
-    """Return where each prompt's relevancy exceeds its threshold."""
-    return maps > maps.new_tensor(list(thresholds)).view(-1, *[1] * (maps.dim() - 1))
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -105,6 +78,8 @@ class Question:
     """Relevancy of every Gaussian to all of these."""
     doubts: tuple[float, ...] = ()
     """Share of unrelated words that match the scene as well, one per prompt."""
+    trusts: tuple[Trust, ...] = ()
+    """How far to believe the answers, one per prompt."""
     thresholds: tuple[float, ...] = ()
     """Relevancy above which Gaussians match, one per prompt."""
     foreground_thresholds: tuple[float, ...] = ()
@@ -130,6 +105,20 @@ class Question:
     def gaussians(self) -> Bool[Tensor, "q n"]:
         """Mask of the Gaussians that match each prompt."""
         return matching(self.relevancy, self.thresholds)
+
+    def alone(self, row: int) -> Question:
+        """Return the question of one of these prompts."""
+        count, one = len(self.prompts), slice(row, row + 1)
+        rows = [row, *range(count, len(self.everywhere))]
+        return replace(
+            self,
+            prompts=self.prompts[one],
+            queries=self.queries.select(rows),
+            everywhere=self.everywhere[rows],
+            doubts=self.doubts[one],
+            trusts=self.trusts[one],
+            thresholds=self.thresholds[one],
+        )
 
     @torch.no_grad()
     def maps(

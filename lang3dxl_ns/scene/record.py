@@ -8,7 +8,7 @@ from __future__ import annotations
 import io
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from difflib import get_close_matches
@@ -24,10 +24,16 @@ from torch import Tensor
 
 from lang3dxl_ns.common.checks import expect, is_coordinate
 from lang3dxl_ns.common.errors import UserError, readable
-from lang3dxl_ns.common.files import read_json, write_atomically
+from lang3dxl_ns.common.files import read_json, replace_file
 from lang3dxl_ns.common.image import resize_nearest
 from lang3dxl_ns.scene.camera import Camera, Lens, check_pose, view_matrix
 from lang3dxl_ns.scene.companions import is_name
+from lang3dxl_ns.scene.georeference import (
+    Georeference,
+    georeference,
+    georeference_from_json,
+    gps_position,
+)
 from lang3dxl_ns.scene.photo import Photo
 
 SCENE_FILE = "lang3dxl_scene.json"
@@ -126,17 +132,26 @@ class SceneRecord:
     clip: str | None
     """Folder or name of the CLIP that made the targets; None for a run with colors only."""
     clip_identity: str | None
-    """Fingerprint of the CLIP's weights."""
+    """Fingerprint of the CLIP's weights and, after a dot, of its tokenizer (`same_clip`)."""
     scale: float
     """Factor in: model's frame = scale · transform · COLMAP's frame."""
     transform: list[list[float]]
     """Matrix [3, 4] that precedes `scale`."""
     data: str
     """Folder of the photos that the run was trained on."""
+    georeference: Georeference | None = None
+    """Meters, up and north, if the photos tell their GPS positions, which are not kept."""
+
+    def located(self, photos: Iterable[Photo]) -> SceneRecord:
+        """Return the record with meters, up and north, if the photos' files tell them."""
+        paths = {photo.name: photo.path for photo in photos}
+        positions = [gps_position(paths[p.name]) if p.name in paths else None for p in self.photos]
+        poses = np.array([photo.camera_to_world for photo in self.photos], dtype=np.float64)
+        return replace(self, georeference=georeference(poses[:, :, 3], poses[:, :, 1].mean(0), positions))
 
     def write(self, path: Path) -> None:
         """Write the file, atomically."""
-        write_atomically(path, json.dumps({"version": _VERSION, **asdict(self)}) + "\n")
+        replace_file(path, json.dumps({"version": _VERSION, **asdict(self)}) + "\n")
 
     @classmethod
     def read(cls, path: Path) -> SceneRecord:
@@ -167,11 +182,21 @@ class SceneRecord:
         raise UserError(f"the scene has no photo {name!r}: it has {len(names)}, such as {', '.join(similar)}")
 
 
+def same_clip(one: str | None, other: str | None) -> bool:
+    """Return whether two fingerprints are of one CLIP. Earlier ones lack the part of the tokenizer, after a
+    dot, and fit any."""
+    if one is None or other is None or "." not in one or "." not in other:
+        return (one or "").partition(".")[0] == (other or "").partition(".")[0]
+    return one == other
+
+
 def scene_from_json(content: dict[str, Any]) -> SceneRecord:
     """Build the description from a JSON object, after validating all its values. Raises ValueError, KeyError,
     TypeError or AttributeError for anything else."""
     photos = [_photo(**photo) for photo in content["photos"]]
-    scene = SceneRecord(**{**content, "photos": photos})
+    meters = content.get("georeference")
+    meters = None if meters is None else georeference_from_json(meters)
+    scene = SceneRecord(**{**content, "photos": photos, "georeference": meters})
     expect(photos != [], "it lists no photo")
     expect(len({photo.name for photo in photos}) == len(photos), "a photo is listed twice")
     for text in (scene.clip, scene.clip_identity):

@@ -268,6 +268,7 @@ def run_folder(
     """Open the capture in a folder, and train it as `fit`; return the folder of the run, by default
     outputs/NAME, and the scene. `restart` forgets the folder's run. Raises as `fit`."""
     check_data(expanded(data))
+    settings.resolve()
     check_encoders(settings.targets.clip, settings.targets.dense)
     capture = open_capture(data, cache_dir=cache_dir)
     say_left_out(capture)

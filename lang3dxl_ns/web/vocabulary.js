@@ -40,13 +40,18 @@ export class Vocabulary {
   /** Look up any phrase in the same way; null if this page doesn't know it. */
   async phrase(text) {
     const plain = [...tidy(text)].slice(0, MOST_TEXT).join(""), known = this.index.get(plain.toLowerCase());
-    if (!this.live || this.taught[known]) return known === undefined ? null : this.word(known);
+    if (!this.live) return known === undefined ? null : this.word(known);
     if (!this.encoded.has(plain)) {
       const answer = await fetch(`api/encode?text=${encodeURIComponent(plain)}`);
       if (!answer.ok) throw new Error(await answer.text());
       this.encoded.set(plain, await answer.json());
     }
     return this.encoded.get(plain);
+  }
+
+  /** Ask the live server anew about a phrase. */
+  forget(text) {
+    this.encoded.delete([...tidy(text)].slice(0, MOST_TEXT).join(""));
   }
 
   /** Find the words spelled most like a phrase, or contained in it. */

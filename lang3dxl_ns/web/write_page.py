@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
-from collections.abc import Iterator, Sequence
+import re
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -16,16 +18,17 @@ from torch import Tensor
 
 from lang3dxl_ns.common.console import tracked
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.common.files import make_folder, write_atomically
+from lang3dxl_ns.common.files import make_folder, replace_file
 from lang3dxl_ns.common.pictures import PHOTO_SUFFIXES
 from lang3dxl_ns.files.scene_file import Provenance
 from lang3dxl_ns.query.doubt import BEST, DOUBTFUL, DOUBTFUL_TAUGHT, LEAST_PEAK
 from lang3dxl_ns.query.heat_maps import PROMPT_COLORS
-from lang3dxl_ns.query.question import EVEN, SHARE
+from lang3dxl_ns.query.negatives import CLEAR, NOTHING, competitors
 from lang3dxl_ns.query.scene import NO_SEMANTICS, Scene
 from lang3dxl_ns.query.text import Prompt, tidy
+from lang3dxl_ns.query.thresholds import EVEN, SHARE
 from lang3dxl_ns.query.visibility import spread
-from lang3dxl_ns.query.vocabulary import CLEAR, NOTHING, common_words, competitors, shipped_vocabulary
+from lang3dxl_ns.query.vocabulary import common_words, shipped_vocabulary
 from lang3dxl_ns.web.pack import (
     LEAST_PIXELS,
     PIXEL_STEPS,
@@ -37,7 +40,9 @@ from lang3dxl_ns.web.pack import (
     pack_splats,
     pack_view,
 )
-from lang3dxl_ns.words.taught_words import known_word
+from lang3dxl_ns.web.photos import extent, photo_json, photos_shown, small_photo
+from lang3dxl_ns.web.teach import PageWords
+from lang3dxl_ns.words.taught_words import TaughtWord, known_word
 
 _HERE = Path(__file__).parent
 _INDEX = _HERE / "index.html"
@@ -52,6 +57,10 @@ _RULES = {
 """Numbers that decide what matches, what is doubtful and what a place is called, for the page's answers."""
 _TEXTS = 256
 """Number of texts encoded at a time."""
+_DATA = re.compile(
+    r"(splats|codes|field|rows|vocabulary|views|look\d+|photo\d+)\.[0-9a-f]{12}\.(bin|json|jpg)"
+)
+"""Names of a page's data files. Nothing else in its folder is ever deleted."""
 MOST_TEXT = 2_000
 """Most characters of a phrase, of which CLIP reads about 300."""
 
@@ -71,8 +80,14 @@ class Page:
     """Title, credit and license shown on the page."""
     look: str | None = None
     """Training photo whose lighting is shown; default: the overview photo."""
+    photos: Path | None = None
+    """Folder of the photos, of which the page shows small copies; if None, it shows their cameras alone."""
+    hide_floaters: bool = False
+    """Whether the page opens with floaters hidden."""
     live: bool = False
     """Whether a server encodes any other text (`answer`)."""
+    own_words: PageWords = field(default_factory=PageWords)
+    """Words that are taught from a live page."""
     left_out: list[str] = field(default_factory=list)
     """Sentences about what the files leave out because of its size."""
 
@@ -113,6 +128,10 @@ class Page:
             "prompts": _phrases(self.prompts),
             "words": None,
         }
+        files |= self._photos(about)
+        about["floaters"], about["hide"] = "api/floaters" if self.live else "floaters.bin", self.hide_floaters
+        if not self.live:
+            files["floaters.bin"] = self.floaters()
         about["looks"] = {name: f"api/look?photo={quote(name)}" for name in self._looks}
         if not self.live:  # without a server the lightings are files, read when they are chosen
             chosen = self._within_limits("lightings", self._looks, [4 * len(scene.splats)] * len(self._looks))
@@ -139,6 +158,22 @@ class Page:
             about["foreground"] = _phrases(self._foreground)
         about["left_out"] = self.left_out
         files["scene.json"] = json.dumps(about).encode()
+        return files
+
+    def _photos(self, about: dict[str, Any]) -> dict[str, bytes]:
+        """Describe the photos' cameras and what the overview shows, and make small photos if asked for."""
+        scene, names, files = self.scene, dict[str, str](), dict[str, bytes]()
+        shown = photos_shown(scene)
+        if self.photos is not None and self.live:
+            names = {photo.name: f"api/photo?name={quote(photo.name)}" for photo in shown}
+        elif self.photos is not None:
+            made = {p.name: small_photo(p, self.photos) for p in tracked(shown, "reading photos")}
+            chosen = self._within_limits("photos", list(made), list(map(len, made.values())))
+            names = {name: f"photo{i}.jpg" for i, name in enumerate(chosen)}
+            files = {file: made[name] for name, file in names.items()}
+        about["cameras"] = [photo_json(photo, names.get(photo.name)) for photo in shown]
+        about["extent"] = extent(scene)
+        about["source"] = {"scene": Path(scene.file.data).name, "clip": scene.file.clip_identity}
         return files
 
     def _within_limits(self, what: str, names: list[str], sizes: list[int]) -> list[str]:
@@ -173,8 +208,7 @@ class Page:
             elif len(against) < len(negatives):
                 special[i] = [[len(negatives) + i], against]
             if known is not None:  # what examples taught, in the scene's own numbers
-                vector = meaning.of_texts(known.vector[None].to(self.scene.device))[0].tolist()
-                learned[i] = {"vector": vector, "bias": known.bias, "text": known.text, "doubt": known.doubt}
+                learned[i] = self._taught(meaning, known)
         described = {"negatives": negatives, "words": words, "naming": len(naming), "special": special}
         described["nothing"] = [i for i, phrase in enumerate(negatives) if phrase in NOTHING]
         described["taught"] = learned
@@ -204,7 +238,29 @@ class Page:
         near, against = self._meant(self._meaning, text)
         vector = self.scene.text.vectors([text]).to(self.scene.device)
         own = self._meaning.of_texts(vector)[0].tolist()
-        return {"own": own, "near": near.tolist(), "against": against}
+        told: dict[str, Any] = {"own": own, "near": near.tolist(), "against": against}
+        known = self.scene.words.get(known_word(text))
+        return told if known is None else told | {"taught": self._taught(self._meaning, known)}
+
+    def _taught(self, meaning: PackedMeaning, word: TaughtWord) -> dict[str, Any]:
+        """Express what examples taught in this scene's own numbers."""
+        vector = meaning.of_texts(word.vector[None].to(self.scene.device))[0].tolist()
+        return {"vector": vector, "bias": word.bias, "text": word.text, "doubt": word.doubt}
+
+    def teach(self, content: Mapping[str, Any]) -> dict[str, Any]:
+        """Teach the scene a word that is marked in the page; see `PageWords.teach`."""
+        self.scene, told = self.own_words.teach(self.scene, content)
+        return {"told": told}
+
+    def photo(self, name: str) -> bytes:
+        """Read a small copy of a photo. Raises UserError if there is none."""
+        if self.photos is None:
+            raise UserError("the photos are not at hand: name their folder with --photos")
+        return small_photo(self.scene.file.photo(name), self.photos)
+
+    def floaters(self) -> bytes:
+        """Compute how surely each Gaussian is a floater, a byte each."""
+        return (self.scene.floating * 255).round().byte().cpu().numpy().tobytes()
 
     def colors(self, photo: str) -> bytes:
         """Compute every Gaussian's color and opacity in a photo's look. Raises UserError if there is none."""
@@ -233,9 +289,29 @@ def write_page(page: Page, folder: Path) -> int:
     if taken and not ours:
         raise UserError(f"{folder} holds {taken[0]}, which is not a scene's page: name a folder of its own")
     files = page.files()
-    for name, content in files.items():
-        write_atomically(folder / name, content)
+    own, data = [path.name for path in _FILES], sorted(files.keys() - {path.name for path in _FILES})
+    data.remove("scene.json")
+    # Data have names by content, which scene.json lists: a page whose writing is stopped, or whose files a
+    # browser or a copy keeps from earlier, never shows the splats of one scene with the words of another.
+    named = {name: _by_content(name, files[name]) for name in data}
+    about = json.loads(files["scene.json"]) | {"files": named}
+    for camera in about["cameras"]:
+        camera["photo"] = named.get(camera["photo"], camera["photo"])
+    for name in own[:1] if not ours else []:  # marks the folder as ours
+        replace_file(folder / name, files[name])
+    for name, stored in named.items():
+        replace_file(folder / stored, files[name])
+    for name in own:
+        replace_file(folder / name, files[name])
+    files["scene.json"] = json.dumps(about).encode()
+    replace_file(folder / "scene.json", files["scene.json"])
     for path in here:  # of the page that this one replaces
-        if path.suffix == ".bin" and path.name not in files:
-            path.unlink()
+        if ours and _DATA.fullmatch(path.name) and path.name not in named.values():
+            path.unlink(missing_ok=True)
     return sum(map(len, files.values()))
+
+
+def _by_content(name: str, content: bytes) -> str:
+    """Return a file's name with a hash of its content: splats.0123456789ab.bin."""
+    stem, _, ending = name.rpartition(".")
+    return f"{stem}.{hashlib.sha256(content).hexdigest()[:12]}.{ending}"

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from lang3dxl_ns.attachment import frames
 from lang3dxl_ns.attachment.frames import Fit, camera_in, find_frame
-from lang3dxl_ns.attachment.known_frames import RUN_TRANSFORM, known_frames
+from lang3dxl_ns.attachment.known_frames import RUN_TRANSFORM, known_frames, registered_frames
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.rendering import render
 from lang3dxl_ns.scene.capture import open_capture
@@ -154,3 +154,14 @@ def test_a_damaged_photo_or_mask_is_not_compared(tmp_path, damaged):
         photo.write_bytes(photo.read_bytes()[:1500])
     with pytest.raises(UserError, match="can't read"):
         find_frame(box_splat(), collection, tmp_path / "a.ply")
+
+
+@pytest.mark.parametrize("kept", [(1, 0, 1), (1, 0, 0), (0, 0, 0)])
+def test_flat_and_thin_shapes_are_aligned_or_a_line_says_that_they_cannot_be(kept, capsys):
+    draw = np.random.default_rng(0)
+    points, means = draw.normal(size=(200, 3)), draw.normal(size=(300, 3)) * kept
+    found = registered_frames(points, means)
+    assert all(np.isfinite(fit).all() and np.linalg.det(fit) > 0 for fit in found.values())
+    assert found or "can't be aligned" in capsys.readouterr().out
+    assert registered_frames(points[:9], means) == {}
+    assert "too few to align by shape: 9 points" in capsys.readouterr().out.replace("\n", " ")
