@@ -106,7 +106,7 @@ def main(arguments: list[str] | None = None) -> None:
         sys.exit(130)
 
 
-_TEXTS = "Texts follow --text: lang3dxl {} RUN --text windows --out {}"
+_TEXTS = "Texts follow --text: lang3dxl {} RUN --text windows{}"
 
 
 def _parsed(words: Sequence[str]) -> Any:
@@ -117,7 +117,7 @@ def _parsed(words: Sequence[str]) -> Any:
         parsed = tyro.cli(choice, args=words, description=__doc__, config=(tyro.conf.OmitArgPrefixes,))
     except SystemExit as error:
         if error.code == 2 and words[0] in ("query", "export"):
-            print(_TEXTS.format(words[0], "found" if words[0] == "query" else "found.ply"), file=sys.stderr)
+            print(_TEXTS.format(words[0], "" if words[0] == "query" else " --out found.ply"), file=sys.stderr)
         raise
     # Shells leave the ~ of --out=~/found as it is.
     vars(parsed).update({name: expanded(v) for name, v in vars(parsed).items() if isinstance(v, Path)})
