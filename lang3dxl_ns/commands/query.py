@@ -62,7 +62,7 @@ class Query:
     """Text to search for, such as '"windows" not "arcades"'. Repeat the flag, or separate texts with `;`."""
     not_: _Not = field(default_factory=list)
     """Negative for all texts, such as arcades. Repeat the flag for more."""
-    out: Path
+    out: Path = Path("found")
     """Folder for the results."""
     image: str | None = None
     """Use the view of this photo, by name."""
@@ -306,8 +306,14 @@ class Export:
             say(f"Wrote {size / 1e6:.1f} MB to {self.web}; see it: {see}")
         if self.out is not None:
             text = prompts[0] if prompts else None
-            hide, how = self.hide_floaters, {"look": self.look, "index": self.index}
-            count = scene.export(self.out, text, everything=self.all, hide_floaters=hide, **how)
+            count = scene.export(
+                self.out,
+                text,
+                everything=self.all,
+                look=self.look,
+                index=self.index,
+                hide_floaters=self.hide_floaters,
+            )
             say(f"Wrote {count} of {len(scene.splats)} Gaussians to {self.out}")
 
     def _clip_words(self, clip: str | None) -> tuple[str, ...]:

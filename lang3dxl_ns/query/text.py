@@ -71,7 +71,8 @@ def parse_prompts(typed: str) -> list[Prompt]:
     Quotes protect a phrase. The grammar is in `query/language.py`. Raises UserError if there is no prompt."""
     (clean,) = texts_of([typed], "a prompt")
     clean = _SINGLE_QUOTES.sub(r'"\1"', clean.translate(_CURLY_QUOTES)).replace("\0", " ")
-    found = phrases_of(clean)
+    # Single spaces, since runs of them would take patterns a time that grows with their square.
+    found = phrases_of(" ".join(clean.split()))
     if not found:
         raise UserError("the prompt is empty: type what to look for, such as rose window")
     if alone := [negatives for text, negatives in found if not text]:

@@ -36,8 +36,8 @@ def bytes_of(run: Training, pixels: int) -> tuple[float, float]:
     words = WORDS if run.learns_words_at_the_end else 0.0
     codes = run.gaussians["codes"] if run.learns_from_renderings and "codes" in run.gaussians else None
     of_codes = 0.0 if codes is None else PER_CODE * codes.shape[1]
-    on_cpu = run.gaussians["means"].device.type == "cpu"
-    many = on_cpu and torch.get_num_threads() > 2  # of two, `PER_GAUSSIAN` has the sums
+    # Of two threads, `PER_GAUSSIAN` has the sums.
+    many = run.gaussians["means"].device.type == "cpu" and torch.get_num_threads() > 2
     fixed = PER_PARAMETER * others + max(PER_PIXEL * pixels, words) + many * MOST_SUMS
     looks = 0.0 if run.parts.appearance is None else PER_LOOK
     return fixed, PER_PARAMETER * numbers + PER_GAUSSIAN + of_codes + looks
