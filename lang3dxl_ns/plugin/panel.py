@@ -24,6 +24,7 @@ from lang3dxl_ns.scene.camera import Camera
 from lang3dxl_ns.scene.record import overview
 
 if TYPE_CHECKING:
+    from nerfstudio.engine.trainer import Trainer
     from nerfstudio.viewer.viewer import Viewer
 
 INVITATION = (
@@ -210,7 +211,7 @@ def stand_of(
     return position, position + max(ahead, 0.05) * forward, fov
 
 
-def _changes(trainer: Any) -> bool:
+def _changes(trainer: Trainer | None) -> bool:
     """Return whether training still changes its model; None: there is no training."""
     if trainer is None or trainer.training_state == "completed":
         return False
