@@ -298,8 +298,10 @@ class Export:
             say(f"Wrote {size / 1e6:.1f} MB to {self.web}; see it: {see}")
         if self.out is not None:
             text = prompts[0] if prompts else None
-            hide, how = self.hide_floaters, {"look": self.look, "index": self.index}
-            count = scene.export(self.out, text, everything=self.all, hide_floaters=hide, **how)
+            count = scene.export(
+                self.out, text, everything=self.all, look=self.look, index=self.index,
+                hide_floaters=self.hide_floaters,
+            )  # fmt: skip
             say(f"Wrote {count} of {len(scene.splats)} Gaussians to {self.out}")
 
     def _clip_words(self, clip: str | None) -> tuple[str, ...]:
