@@ -229,7 +229,8 @@ class Lang3DXLDataManager(FullImageDatamanager):
         used += [foreground_kind(c)] if c.foreground == "text" else []
         used += [REGIONS] if self._region_source is not None else []
         names = [photo.name for d in (self.train_dataset, self.eval_dataset) for photo in d.photos]
-        return FeatureStore(self.cache_dir).clean(used, names)
+        shared = self.config.cache_dir is not None
+        return FeatureStore(self.cache_dir).clean(used, names, shared)
 
     @cached_property
     def crop_plan(self) -> CropPlan:
@@ -272,7 +273,7 @@ class Lang3DXLDataManager(FullImageDatamanager):
         return SceneRecord(
             photos=[*trained, *(photo for photo in held_out if photo.name not in names)],
             clip=None if known is None else known.address,
-            clip_identity=None if known is None else known.identity,
+            clip_identity=None if known is None else known.clip_identity,
             scale=frame.scale,
             transform=frame.transform.tolist(),
             data=str(expanded(self.data_folder).absolute()),

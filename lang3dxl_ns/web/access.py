@@ -54,6 +54,10 @@ class Access:
             host, origin = _only(headers, "Host") or "", _only(headers, "Origin")
             # With a token any name passes.
             ours = self.needs_token or urlsplit(f"//{host}").hostname in (*LOCAL_NAMES, self.host)
+            # Other sites' pages may link here, but not make this server work with pictures or scripts.
+            site, mode = (headers.get(f"Sec-Fetch-{name}") for name in ("Site", "Mode"))
+            if site == "cross-site" and mode != "navigate" and not self.needs_token:
+                return _refused("This page answers its own requests alone.")
             if not ours or (origin is not None and not _same_site(origin, host)):
                 return _refused(f"This page is not served to {origin or host}.")
             if not self.needs_token or self._knows_token(headers):

@@ -18,7 +18,7 @@ from lang3dxl_ns.preparation.photo_cache import PhotoCache
 from lang3dxl_ns.preparation.store import FeatureStore
 from lang3dxl_ns.preparation.working_photos import WorkingPhotos
 from lang3dxl_ns.scene.camera import view_matrix
-from lang3dxl_ns.training.initialization import sphere_around
+from lang3dxl_ns.training.gaussians import sphere_around
 
 
 def photo(index: int) -> dict[str, torch.Tensor]:

@@ -33,6 +33,12 @@ def test_words_looks_and_pixels_take_memory(model, monkeypatch):
     assert cap(model, 8e9, monkeypatch) > most
 
 
+def test_sums_of_many_threads_are_planned_with(model, monkeypatch):
+    most = cap(model, 8e9, monkeypatch)
+    monkeypatch.setattr(sizes.torch, "get_num_threads", lambda: 64)
+    assert cap(model, 8e9, monkeypatch) < most
+
+
 def test_the_present_gaussians_are_kept_and_a_wish_is_obeyed(model, monkeypatch):
     assert cap(model, 1e6, monkeypatch) == model.num_points  # too little
     assert cap(model, 1e6, monkeypatch, wanted=70) == 70

@@ -29,9 +29,9 @@ def test_a_scene_file_knows_what_its_words_are_searched_as():
 @pytest.mark.parametrize(
     ("typed", "hint"), [("door not gate", '"door" not "gate"'), ('"windows" not', '"windows" not "…"')]
 )
-def test_a_not_that_tells_nothing_apart_is_explained(typed, hint, capsys):
+def test_a_not_that_tells_nothing_apart_is_explained(typed, hint):
     (prompt,) = parse_prompts(typed)
-    assert not prompt.negatives and hint in capsys.readouterr().out
+    assert not prompt.negatives and hint in caution(prompt.text)
 
 
 def test_a_prompt_longer_than_clip_reads_is_said_to_be():
