@@ -90,12 +90,13 @@ def judged(
     best = f"the best places for {text!r} fit at {peak:.2f}"
     if peak < FAINT:
         return Trust("doubtful", f"{best}, and other words fit better there: it may not be here", remedy)
-    world = f"; this scene is {foreign:.1f} times as far from what its CLIP was trained on as usual"
+    usual = "times as far from what its CLIP was trained on as usual"
+    world = f"; this scene is {foreign:.1f} {usual}" if far else ""
     if peak < (CLEARLY_FAR if far else CLEARLY):
-        return Trust("uncertain", f"{best}, where right words reach 1.00{world if far else ''}", remedy)
+        return Trust("uncertain", f"{best}, where right words reach 1.00{world}", remedy)
     if alike:
         return Trust("uncertain", f"{text!r} selects the same as {' and '.join(alike)}", remedy, tuple(alike))
-    return Trust("sure", f"{best}{world if far else ''}")
+    return Trust("sure", f"{best}{world}")
 
 
 def alike(
