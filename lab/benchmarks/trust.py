@@ -54,7 +54,7 @@ class TrustBenchmark:
         rows, foreign = list[list[object]](), dict[str, float | None]()
         for path, truth in zip(self.scene, self.ground_truth, strict=True):
             scene = load_scene(path)
-            name = str(Path(scene.file.data).parent.name + "/" + Path(scene.file.data).name)
+            name = truth.name if truth.name != "ground_truth" else truth.parent.parent.name
             foreign[name] = scene.foreignness
             rows += [[name, *row] for row in self.judged(scene, GroundTruth(truth))]
         right = [row for row in rows if row[2] is not None and float(str(row[2])) >= RIGHT]

@@ -25,7 +25,7 @@ from lang3dxl_ns.query.language import TABLE
 from lang3dxl_ns.query.question import EVEN, SHARE
 from lang3dxl_ns.query.scene import NO_SEMANTICS, Scene
 from lang3dxl_ns.query.text import Prompt, tidy
-from lang3dxl_ns.query.trust import ALIKE, ANCHORS, CLEARLY, CLEARLY_FAR, FAINT, FAR
+from lang3dxl_ns.query.trust import ALIKE, ANCHORS, CLEARLY, FAINT, FAR, STRICTER, STRICTEST
 from lang3dxl_ns.query.visibility import spread
 from lang3dxl_ns.query.vocabulary import (
     CLEAR,
@@ -58,7 +58,7 @@ _MOST_BYTES = 8_000_000
 _RULES = {
     **{"best": BEST, "doubtful": DOUBTFUL, "doubtful_taught": DOUBTFUL_TAUGHT, "least_peak": LEAST_PEAK},
     **{"even": EVEN, "share": SHARE, "clear": CLEAR, "alike": ALIKE, "faint": FAINT},
-    **{"clearly": CLEARLY, "clearly_far": CLEARLY_FAR, "far": FAR},
+    **{"clearly": CLEARLY, "stricter": STRICTER, "strictest": STRICTEST, "far": FAR},
 }
 """Numbers that decide what matches, what is doubtful and what a place is called, for the page's answers."""
 _RANKING = ("PEAK", "LARGE", "RIM", "STRONG", "CORE", "JOINED", "OUTLIERS", "DENSE")

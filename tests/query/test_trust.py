@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from lang3dxl_ns.query.trust import ANCHORS, CLEARLY, CLEARLY_FAR, FAINT, FAR, alike, judged, known_world
+from lang3dxl_ns.query.trust import ANCHORS, CLEARLY, FAINT, FAR, alike, judged, known_world, least_peak
 
 
 @pytest.mark.parametrize(
@@ -14,8 +14,10 @@ from lang3dxl_ns.query.trust import ANCHORS, CLEARLY, CLEARLY_FAR, FAINT, FAR, a
         (0.01, FAINT - 0.01, None, "doubtful"),
         (0.01, CLEARLY - 0.01, None, "uncertain"),
         (0.01, CLEARLY, FAR - 0.01, "sure"),
-        (0.01, CLEARLY_FAR - 0.01, FAR, "uncertain"),
-        (0.01, CLEARLY_FAR, FAR, "sure"),
+        (0.01, CLEARLY, FAR, "uncertain"),
+        (0.01, 0.94, 2.8, "uncertain"),
+        (0.01, least_peak(FAR), FAR, "sure"),
+        (0.01, 1.0, 5.0, "sure"),
     ],
 )
 def test_an_answer_is_trusted_by_its_peak_its_doubt_and_its_world(doubt, peak, foreign, level):
