@@ -8,6 +8,8 @@ from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
+from lang3dxl_ns.common.threads import sleep_soon
+
 _PUBLIC = {
     "load_scene": "open_scene",
     "attach": "attachment.attach",
@@ -24,6 +26,8 @@ try:
     __version__ = version("lang3dxl-ns")
 except PackageNotFoundError:  # a checkout that is not installed
     __version__ = "0"
+
+sleep_soon()
 
 
 def __getattr__(name: str) -> Any:

@@ -10,7 +10,7 @@ import sys
 import threading
 from collections.abc import Iterator, Mapping, Sequence
 from contextvars import copy_context
-from dataclasses import make_dataclass
+from dataclasses import dataclass
 from difflib import get_close_matches
 from functools import reduce
 from importlib import import_module
@@ -22,7 +22,7 @@ import tyro
 
 from lang3dxl_ns.common.checks import disk_trouble
 from lang3dxl_ns.common.console import accept_any_console, silence_libraries
-from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.errors import NO_NERFSTUDIO, UserError, misses_nerfstudio
 from lang3dxl_ns.common.files import expanded
 from lang3dxl_ns.common.memory import ran_out_of_memory
 from lang3dxl_ns.common.settings_help import asked_for_all
@@ -83,6 +83,10 @@ def main(arguments: list[str] | None = None) -> None:
         # Messages name the options of ns-train, which these two pass on; others have them without the prefix.
         prefix = "--" if words[0] in ("demo", "benchmark") else "--pipeline.datamanager."
         sys.exit(f"Error: {str(error).replace(prefix, '--')}")
+    except ModuleNotFoundError as error:
+        if not misses_nerfstudio(error):
+            raise
+        sys.exit(f"Error: {NO_NERFSTUDIO}")
     except BrokenPipeError:  # the reader closed the pipe, as in `lang3dxl … | head`
         _leave_output()
         sys.exit(1)
@@ -137,11 +141,16 @@ def _leave_output() -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
+@dataclass
+class _NotCalled:
+    """Stands for a command that was not called."""
+
+
 def _choice(commands: Mapping[str, Any], words: Sequence[str]) -> Any:
     """Build tyro's type for a choice of subcommands. Only the called one is imported: most need torch."""
     kinds = []
     for name, (place, summary) in commands.items():
-        kind, described = make_dataclass("NotCalled", []), summary
+        kind, described = _NotCalled, summary
         if words[:1] == [name]:
             group = isinstance(place, Mapping)
             kind = _choice(place, words[1:]) if group else settings_of(place)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,7 +11,7 @@ import torch
 
 from lang3dxl_ns.common.console import silence_libraries
 from lang3dxl_ns.common.device import best_device
-from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.errors import NO_NERFSTUDIO, UserError, misses_nerfstudio
 from lang3dxl_ns.common.files import expanded
 from lang3dxl_ns.files.runs import OUTPUTS, find_config
 from lang3dxl_ns.files.scene_file import SUFFIX, Provenance, describe_scene_file, read_scene
@@ -45,8 +47,8 @@ def load_scene(
             encode_texts = text_encoder(about, device or best_device())
         return read_scene(file, device, settings, encode_texts)
     silence_libraries()  # nerfstudio's imports print warnings that a user can do nothing about
-    from lang3dxl_ns.plugin.load_scene import load_run
-
+    with _nerfstudio():
+        from lang3dxl_ns.plugin.load_scene import load_run
     return load_run(path, device, settings, clip)
 
 
@@ -74,8 +76,8 @@ def train(
         UserError: the photos cannot be used, or training was interrupted.
     """
     silence_libraries()
-    from lang3dxl_ns.methods import lang3dxl, run_config
-
+    with _nerfstudio():
+        from lang3dxl_ns.methods import lang3dxl, run_config
     usual = lang3dxl.config.pipeline.datamanager
     models = clip or usual.clip, dense or usual.dense  # type: ignore[attr-defined]
     steps = lang3dxl.config.max_num_iterations if iterations is None else iterations
@@ -92,6 +94,17 @@ def train(
         stopped = f"training was stopped; to resume: ns-train with --load-dir {trainer.checkpoint_dir}"
         raise UserError(stopped) from error
     return load_scene(trainer.base_dir)
+
+
+@contextmanager
+def _nerfstudio() -> Iterator[None]:
+    """Import what needs nerfstudio. Raises UserError if it is not installed."""
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        if not misses_nerfstudio(error):
+            raise
+        raise UserError(NO_NERFSTUDIO) from error
 
 
 def find_scene_file(path: str | Path | None = None) -> Path | None:

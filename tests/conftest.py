@@ -12,12 +12,15 @@
   has one.
 """
 
+import ast
 import gc
 import inspect
 import os
 import sys
 from collections import Counter
 from copy import deepcopy
+from functools import cache
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -50,8 +53,39 @@ def callers(context: int = 0) -> list[inspect.FrameInfo]:
 inspect.stack = callers
 
 
+HAS_NERFSTUDIO = find_spec("nerfstudio") is not None
+NEEDS_NERFSTUDIO = ("nerfstudio", "viser", "lang3dxl_ns.plugin", "lang3dxl_ns.methods")
+
+
+@cache
+def imports_nerfstudio(path: Path) -> bool:
+    """Whether a file of tests imports nerfstudio, or our side of it, at its top."""
+    names = []
+    for node in ast.parse(path.read_text()).body:
+        if isinstance(node, ast.ImportFrom):
+            names.append(f"{node.module}.")
+        elif isinstance(node, ast.Import):
+            names += [f"{alias.name}." for alias in node.names]
+    return any(name.startswith(f"{need}.") for name in names for need in NEEDS_NERFSTUDIO)
+
+
+def pytest_ignore_collect(collection_path: Path) -> bool | None:
+    """Without nerfstudio, tests of the plugin and files that import it are left out. `.ci/run` tests the base
+    so, on a newer Python."""
+    if HAS_NERFSTUDIO or collection_path.suffix != ".py":
+        return None
+    return True if "plugin" in collection_path.parts or imports_nerfstudio(collection_path) else None
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Files with slow tests first: at the end, a slow test would leave the other process idle."""
+    """Files with slow tests first: at the end, a slow test would leave the other process idle. Tests that
+    train with nerfstudio, or are marked so, are skipped without it."""
+    if not HAS_NERFSTUDIO:
+        for item in items:
+            if {"train", "two_steps"} & set(getattr(item, "fixturenames", ())) or item.get_closest_marker(
+                "nerfstudio"
+            ):
+                item.add_marker(pytest.mark.skip(reason="needs nerfstudio: pip install -e '.[nerfstudio]'"))
     slow = Counter(item.path for item in items if item.get_closest_marker("slow"))
     items.sort(key=lambda item: -slow[item.path])
 

@@ -2,7 +2,6 @@
 
 import contextlib
 import json
-import math
 import os
 import shutil
 from pathlib import Path
@@ -15,9 +14,6 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from PIL import Image
 from scenes import write_scene
-from viser._messages import ViewerCameraMessage
-from websockets.datastructures import Headers
-from websockets.exceptions import InvalidHeaderValue
 
 from lang3dxl_ns.common import presets
 from lang3dxl_ns.common.errors import UserError
@@ -26,7 +22,6 @@ from lang3dxl_ns.evaluation.ground_truth import GroundTruth
 from lang3dxl_ns.methods import lang3dxl
 from lang3dxl_ns.plugin.run_checkpoint import check_checkpoint, read_checkpoint
 from lang3dxl_ns.plugin.trainer_config import read_config
-from lang3dxl_ns.plugin.viewer_guard import Guard, is_camera
 from lang3dxl_ns.preparation.regions import FolderRegions
 from lang3dxl_ns.preparation.store import FeatureStore
 from lang3dxl_ns.scene.camera import Lens
@@ -45,6 +40,8 @@ fuzz = settings(
     derandomize=True,
     suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
 )
+WRITTEN = [form for form in FORMATS if form != "HEIF"]
+"""Formats that Pillow writes."""
 JSON = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=8),
     lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=8), inner, max_size=4),
@@ -110,12 +107,12 @@ def pictures(tmp_path_factory):
     """Pictures of every accepted format."""
     folder = tmp_path_factory.mktemp("pictures")
     image = Image.effect_noise((24, 16), 60).convert("RGB")
-    for form in FORMATS:
+    for form in WRITTEN:
         image.save(folder / form, form)
     return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
-@pytest.mark.parametrize("form", FORMATS)
+@pytest.mark.parametrize("form", WRITTEN)
 @fuzz
 @given(data=st.data())
 def test_photos_and_masks(pictures, tmp_path, form, data):
@@ -263,56 +260,7 @@ def test_configs(settings_of_a_run, tmp_path, data):
         read_config(tmp_path / "config.yml")
 
 
-# ── the viewer's port ───────────────────────────────────────────────────────────────────────────────────
-
-TEXT = st.text(st.characters(min_codepoint=32, max_codepoint=255, exclude_characters="\x7f"), max_size=20)
-"""What can stand in a header at all: websockets refuses others."""
-
-
-@pytest.fixture(scope="module")
-def page(tmp_path_factory):
-    """Folder of a page."""
-    folder = tmp_path_factory.mktemp("around") / "build"
-    folder.mkdir()
-    (folder / "index.html").write_text("page")
-    (folder.parent / "secret").write_text("secret")
-    return folder
-
-
-@fuzz
-@given(
-    path=TEXT | st.lists(st.sampled_from(["..", ".", "/", "secret", "index.html", "%2e", "?"])).map("".join),
-    headers=st.dictionaries(st.sampled_from(["Host", "Origin", "Cookie", "Upgrade"]), TEXT),
-    host=st.sampled_from(["127.0.0.1", "0.0.0.0"]),
-)
-def test_requests(page, path, headers, host):
-    local = {"Host": "127.0.0.1:7007"} | {k: v for k, v in headers.items() if k != "Host"}
-    for these in (headers, local):
-        try:
-            received = Headers(these)
-        except InvalidHeaderValue:  # websockets refuses it before we see it
-            continue
-        answer = Guard(host, 7007, root=page).response(path, received)
-        assert host == "127.0.0.1" or (answer is not None and answer[0] in (400, 403))
-        if answer is None:
-            assert these.get("Upgrade", "").lower() == "websocket"
-        else:
-            assert answer[0] >= 400 or answer[2] == b"page"
-
-
-@fuzz
-@given(
-    vectors=st.tuples(*(st.tuples(*[NUMBERS] * size) for size in (4, 3, 3, 3))),
-    fov=NUMBERS,
-    aspect=NUMBERS,
-)
-def test_cameras_of_pages(vectors, fov, aspect):
-    wxyz, position, look_at, up = vectors
-    camera = ViewerCameraMessage(wxyz, position, fov, aspect, look_at, up)
-    if is_camera(camera):
-        height = int(512 / aspect)  # as nerfstudio's viewer chooses a picture's size
-        assert 0 < height < 1e5 and math.isfinite(math.tan(fov / 2)) and math.tan(fov / 2) > 0
-        assert all(map(math.isfinite, (*position, *look_at)))
+# ── names of files ──────────────────────────────────────────────────────────────────────────────────────
 
 
 @fuzz

@@ -18,6 +18,8 @@ from lab.baselines import BASELINES, langsplat
 from lang3dxl_ns.components.compression import CompressedField
 from lang3dxl_ns.open_scene import load_scene
 
+pytestmark = pytest.mark.nerfstudio
+
 EVERYTHING = {
     "pipeline__model__decoder__name": "paper",
     "pipeline__model__densify_grad_thresh": 1e-7,

@@ -137,6 +137,7 @@ def test_pooled_figures_that_are_no_numbers(value, tmp_path, monkeypatch):
         main(["evaluate", "pool", "--reports", "a.json", "--out", "report"])
 
 
+@pytest.mark.nerfstudio
 def test_ground_truth_that_is_no_folder():
     with pytest.raises(SystemExit, match="nope is not a folder"):
         main(["evaluate", "run", "none", "--ground-truth", "nope", "--out", "report"])

@@ -40,7 +40,6 @@ from lang3dxl_ns.preparation.encoders import (
     load_dense_encoder,
     load_image_text_encoder,
 )
-from lang3dxl_ns.preparation.photo_collection import read_collection
 from lang3dxl_ns.preparation.pyramid import THIRD, build_clip_target
 from lang3dxl_ns.preparation.settings import PreparationConfig
 from lang3dxl_ns.preparation.targets import TargetReader
@@ -50,8 +49,10 @@ from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.rendering import composite
 from lang3dxl_ns.rendering.gathering import Pixels, gather
 from lang3dxl_ns.scene.camera import resized
+from lang3dxl_ns.scene.capture import open_capture
 from lang3dxl_ns.scene.record import ScenePhoto
-from lang3dxl_ns.training.learn_codes import DENSE_AXES, sharpen
+from lang3dxl_ns.training.learn_codes import DENSE_AXES
+from lang3dxl_ns.training.sharpening import sharpen
 
 TRAINING_SEEDS = range(10_000, 20_000)
 """Landmarks of the built-in encoders' own training."""
@@ -175,7 +176,7 @@ class Gathering:
     @classmethod
     def of(cls, run: Path, scene: Scene) -> Gathering:
         photos = {photo.name: photo for photo in scene.photos if photo.split == "train"}
-        collection = read_collection(run / "scene")
+        collection = open_capture(run / "scene")
         collection = replace(collection, photos=[p for p in collection.photos if p.name in photos])
         config = settled(PreparationConfig(clip="builtin"))
         _, targets = prepare_photos(collection, config, run / "scene" / "lang3dxl_cache", "cpu")

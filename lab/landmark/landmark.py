@@ -37,6 +37,8 @@ class Landmark:
     """Height of the building, meters."""
     obstacles: Float[Array, "n 2 3"]
     """Bounds (lower and upper corner) of everything but the ground, which keep cameras and people out."""
+    things: tuple[tuple[str, range], ...] = ()
+    """Part and range of shapes of every dome, tower, spire and minaret, see `ShapeList.things`."""
 
     @classmethod
     def from_seed(cls, seed: int, family: str | None = None) -> Landmark:
@@ -58,6 +60,7 @@ class Landmark:
         return cls(
             seed=seed, family=family, shapes=tuple(builder.shapes), materials=tuple(builder.materials),
             center=center, radius=radius, height=float(high[2]), obstacles=np.array(standing),
+            things=tuple(builder.things),
         )  # fmt: skip
 
     def is_free(self, point, margin: float) -> bool:

@@ -16,12 +16,12 @@ from lang3dxl_ns.evaluation.photo_metrics import EvaluatedPhoto
 from lang3dxl_ns.evaluation.scores import open_scorer
 from lang3dxl_ns.plugin.cameras import to_nerfstudio
 from lang3dxl_ns.plugin.photo_dataset import PhotoDataset
-from lang3dxl_ns.preparation.foreground import find_mask
 from lang3dxl_ns.preparation.physical_scale import pixel_sizes
 from lang3dxl_ns.preparation.prepare import prepare
 from lang3dxl_ns.preparation.store import FeatureStore
 from lang3dxl_ns.scene.camera import camera_to_world
 from lang3dxl_ns.scene.colmap import TrackedPhoto
+from lang3dxl_ns.scene.masks import find_mask
 from lang3dxl_ns.scene.photo import Photo
 
 if TYPE_CHECKING:

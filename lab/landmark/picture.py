@@ -10,6 +10,8 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from numpy import ndarray as Array
+from PIL import Image, ImageDraw, ImageFont
+from scipy.ndimage import binary_erosion
 
 from lang3dxl_ns.evaluation.scores import resize_map
 from lang3dxl_ns.query.heat_maps import overlay
@@ -19,6 +21,11 @@ COLUMNS = 4
 """Number of prompts shown per photo."""
 FOUND = (1.0, 0.0, 1.0)
 """Outline color of matches: magenta, which no heat map contains."""
+CAPTION = (
+    "Right columns: heat shows where the word fits; magenta outlines what it found, white the ground truth."
+)
+WIDTH, _GAP, _LINE = 260, 6, 24
+"""Width of a column, the gap between columns, and the height of a line of text, pixels."""
 
 
 @dataclass
@@ -49,40 +56,51 @@ def most_telling(rows: Sequence[PictureRow], count: int) -> list[PictureRow]:
 
 def draw_picture(rows: Sequence[PictureRow], path: Path) -> None:
     """Write a PNG with one row per photo: photo, rendering, codes as color, and the match of each prompt. A
-    match is drawn as its heat map, outlined in magenta, with the ground truth outlined in white."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib.figure import Figure
-
-    columns = 3 + min(COLUMNS, max(len(row.truth) for row in rows))
-    figure = Figure(figsize=(2.6 * columns, 2.15 * len(rows)), layout="constrained")
-    axes = figure.subplots(len(rows), columns, squeeze=False)
-    for line, row in zip(axes, rows, strict=True):
-        for axis in line:
-            axis.axis("off")
-        pictures = {"held-out photo": row.photo, "rendering": row.rendering, "3-number codes": row.codes}
-        for axis, (title, image) in zip(line, pictures.items(), strict=False):
-            axis.imshow(np.clip(image, 0, 1))
-            axis.set_title(title, fontsize=10)
-        rarest = sorted(row.truth, key=lambda prompt: row.truth[prompt].mean())[:COLUMNS]
-        for axis, prompt in zip(line[3:], rarest, strict=False):
-            _draw_prompt(axis, prompt, row)
+    match is drawn as its heat map, outlined in magenta, with the ground truth outlined in white; the last
+    line of the picture says so."""
+    lines = [_cells(row) for row in rows]
+    height = max(_scaled_height(image) for cells in lines for _, image in cells)
+    canvas = Image.new("RGB", (max(map(len, lines)) * WIDTH, len(lines) * (height + _LINE) + _LINE), "white")
+    pen, font = ImageDraw.Draw(canvas), ImageFont.load_default(_LINE * 0.6)
+    for y, cells in enumerate(lines):
+        for x, (title, image) in enumerate(cells):
+            left, top = x * WIDTH, y * (height + _LINE)
+            pen.text((left + WIDTH / 2, top + _LINE / 2), title, "black", font, anchor="mm")
+            drawn = Image.fromarray((np.clip(image, 0, 1) * 255).round().astype(np.uint8))
+            canvas.paste(drawn.resize((WIDTH - _GAP, _scaled_height(image))), (left, top + _LINE))
+    pen.text((_GAP, canvas.height - _LINE / 2), CAPTION, "black", font, anchor="lm")
     path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=100)
+    canvas.save(path)
 
 
-def _draw_prompt(axis, prompt: str, row: PictureRow) -> None:
-    match, truth = row.matches[prompt], row.truth[prompt]
-    height, width = truth.shape
-    relevancy, mask = torch.from_numpy(match.relevancy), torch.from_numpy(match.mask)
+def _cells(row: PictureRow) -> list[tuple[str, Float[Array, "h w 3"]]]:
+    """Titles and images of one photo, the rarest prompts first."""
+    rarest = sorted(row.truth, key=lambda prompt: row.truth[prompt].mean())[:COLUMNS]
+    return [
+        ("held-out photo", row.photo),
+        ("rendering", row.rendering),
+        ("3-number codes", row.codes),
+        *((f"“{prompt}”", _answer(prompt, row)) for prompt in rarest),
+    ]
+
+
+def _scaled_height(image: Float[Array, "h w 3"]) -> int:
+    return max(round(image.shape[0] * (WIDTH - _GAP) / image.shape[1]), 1)
+
+
+def _answer(prompt: str, row: PictureRow) -> Float[Array, "h w 3"]:
+    """Draw a prompt's heat over the gray rendering, and outline the match and the ground truth."""
+    match = row.matches[prompt]
+    size = (_scaled_height(row.rendering), WIDTH - _GAP)
     gray = torch.from_numpy(row.rendering).float().mean(dim=2).expand(3, -1, -1)
-    picture = resize_map(gray, (mask.shape[0], mask.shape[1])).permute(1, 2, 0).clamp(0, 1)
-    axis.imshow(overlay(picture, relevancy, mask, match.threshold).numpy(), extent=(0, width, height, 0))
-    for region, color in ((truth, "white"), (match.mask, FOUND)):
-        place = {"extent": (0, width, 0, height), "levels": [0.5], "linewidths": 1}
-        if region.any() and not region.all():  # matplotlib warns about a contour without a line
-            axis.contour(region.astype(float), colors=[color], **place)
-    axis.set_xlim(0, width)
-    axis.set_ylim(height, 0)
-    axis.set_title(f"“{prompt}”", fontsize=10)
+    picture = resize_map(gray, size).permute(1, 2, 0).clamp(0, 1)
+    relevancy = resize_map(torch.from_numpy(match.relevancy).float()[None], size)[0]
+    found = _resized_mask(match.mask, size)
+    drawn = overlay(picture, relevancy, torch.from_numpy(found), match.threshold).numpy()
+    for region, color in ((_resized_mask(row.truth[prompt], size), (1.0, 1.0, 1.0)), (found, FOUND)):
+        drawn[region & ~binary_erosion(region)] = color
+    return drawn
+
+
+def _resized_mask(mask: Bool[Array, "h w"], size: tuple[int, int]) -> Bool[Array, "rows columns"]:
+    return np.array(Image.fromarray(mask).resize(size[::-1], Image.Resampling.NEAREST))

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import wraps
+from typing import Any, TypeVar, cast
 
 import numpy as np
 
@@ -11,6 +14,20 @@ from lab.landmark.materials import Material
 from lab.landmark.shapes import Box, Ellipsoid, Frustum, Polytope, Shape, gable, prism
 
 Point = tuple[float, float, float]
+Build = TypeVar("Build", bound=Callable[..., None])
+
+
+def is_thing(build: Build) -> Build:
+    """Decorate a function that builds one dome, tower, spire or minaret, so that its shapes are recorded."""
+
+    @wraps(build)
+    def recorded(b: ShapeList, *args: Any, **settings: Any) -> None:
+        first = len(b.shapes)
+        build(b, *args, **settings)
+        part = build.__name__ if build.__name__ in PART else "spire"  # a pinnacle is a small spire
+        b.things.append((part, range(first, len(b.shapes))))
+
+    return cast(Build, recorded)
 
 
 @dataclass
@@ -22,6 +39,9 @@ class ShapeList:
     materials: list[Material] = field(default_factory=list)
     role: dict[str, int] = field(default_factory=dict)
     """Index into `materials` by role: "wall", "trim", "dome" …"""
+    things: list[tuple[str, range]] = field(default_factory=list)
+    """Domes, towers, spires and minarets: the part, and the range of the shapes that building it added, of
+    which those with this part belong to it."""
 
     def add_material(self, material: Material) -> int:
         self.materials.append(material)

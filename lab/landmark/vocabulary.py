@@ -10,7 +10,7 @@ import numpy as np
 from lab.landmark.labels import ELEMENT, PART
 from lab.landmark.materials import COVERING, MASONRY, make_material
 from lab.landmark.openings import Openings
-from lab.landmark.shape_list import Point, ShapeList
+from lab.landmark.shape_list import Point, ShapeList, is_thing
 
 FRONT, LEFT, BACK, RIGHT = 0.0, math.pi / 2, math.pi, -math.pi / 2
 """Facings of walls, as angles from +x, which the façade faces."""
@@ -133,6 +133,7 @@ def _opening(b, part, element, foot, facing, field_, size, style, tiles=(1, 1), 
     b.shapes.append(opening)
 
 
+@is_thing
 def dome(
     b: Builder, foot: Point, radius: float, drum: float, windows: bool = True, onion: bool | None = None
 ) -> None:
@@ -176,6 +177,7 @@ def _onion(b: Builder, foot: Point, radius: float) -> float:
     return lower + join + height
 
 
+@is_thing
 def spire(b: Builder, foot: Point, radius: float, height: float) -> None:
     """Add a steep pointed roof, round or with four or eight sides, with a cross on top."""
     if b.round_spires:
@@ -190,12 +192,14 @@ def spire(b: Builder, foot: Point, radius: float, height: float) -> None:
         b.box("spire", "trim", (x, y, z + height + 0.3 * radius), (bar, 5 * bar, bar))
 
 
+@is_thing
 def pinnacle(b: Builder, foot: Point, radius: float, height: float) -> None:
     """Add a small spire on a square shaft."""
     b.box("spire", "trim", foot, (radius * 1.7, radius * 1.7, height * 0.35))
     b.prism("spire", "spire", above(foot, height * 0.35), radius, height * 0.65, 4, taper=1.0)
 
 
+@is_thing
 def tower(
     b: Builder, foot: Point, width: float, height: float, top: str, sides=4, bare: tuple[float, ...] = ()
 ) -> None:
@@ -259,6 +263,7 @@ def battlements(b: Builder, foot: Point, width: float, count: int = 5) -> None:
             b.box("tower", "tower", (x + edge, y + along, z), (merlon * 0.6, merlon, merlon * 1.1))
 
 
+@is_thing
 def minaret(
     b: Builder, foot: Point, radius: float, height: float, balconies: int, octagonal: bool, cap: str
 ) -> None:

@@ -22,12 +22,12 @@ from lang3dxl_ns.common.stages import Stages
 from lang3dxl_ns.files.read_splats import find_splats, read_splats
 from lang3dxl_ns.files.scene_file import Provenance, check_scene_name, replace_scene
 from lang3dxl_ns.preparation.model_files import check_encoders, option_prefix
-from lang3dxl_ns.preparation.photo_collection import PhotoCollection, read_collection
 from lang3dxl_ns.preparation.segmentation import find_text_segmenter, load_text_segmenter
 from lang3dxl_ns.query.match import save_picture
 from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.query.text import taught_prompt
 from lang3dxl_ns.rendering import Splats
+from lang3dxl_ns.scene.capture import Capture, open_capture
 from lang3dxl_ns.scene.photo_folder import check_data
 
 _LIGHT = 0.15
@@ -51,7 +51,7 @@ def attach(
 
     Args:
         splat: file or run of the splat, as `read_splats` takes it.
-        data: photos of the splat, as `read_collection` takes them. None renders views of the splat, which are
+        data: photos of the splat, as `open_capture` takes them. None renders views of the splat, which are
             kept in the hidden folder .NAME.views beside `out`.
         out: scene file to write; None (with `data`): none is written.
         config: settings.
@@ -96,7 +96,7 @@ def attach(
             folder = place.with_name(f".{place.stem}.views")
             collection, similarity = rendered_views(splats, config.views, config.up, folder), np.eye(4)
         else:
-            collection = read_collection(data)
+            collection = open_capture(data)
             similarity = _frame(splats, collection, path, place)
     with stages.stage("prepare"):
         cache = expanded(config.cache_dir or collection.folder / "lang3dxl_cache")
@@ -127,7 +127,7 @@ def attach(
     return scene
 
 
-def _frame(splats: Splats, collection: PhotoCollection, path: Path, place: Path | None) -> Similarity:
+def _frame(splats: Splats, collection: Capture, path: Path, place: Path | None) -> Similarity:
     """Find and report the similarity from the photos' frame to the splat's, or raise UserError."""
     if collection.left_out:
         say(f"{len(collection.left_out)} photos are left out: {some(list(collection.left_out.values()), 3)}")

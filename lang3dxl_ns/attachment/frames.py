@@ -17,10 +17,10 @@ from torch import Tensor
 from lang3dxl_ns.attachment.known_frames import Similarity, known_frames, registered_frames
 from lang3dxl_ns.common.console import progress, tracked
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.preparation.photo_collection import PhotoCollection
 from lang3dxl_ns.query.match import as_bytes
 from lang3dxl_ns.rendering import Splats, rasterize, render
 from lang3dxl_ns.scene.camera import Camera, resized
+from lang3dxl_ns.scene.capture import Capture
 from lang3dxl_ns.scene.colmap import TrackedPhoto
 
 FITS, FITS_FEW = 0.5, 0.65
@@ -79,7 +79,7 @@ def camera_in(similarity: Similarity | Float[Tensor, "4 4"], tracked: TrackedPho
     return tracked.lens.camera(torch.cat([scale * view[:3], view[3:]]).float())  # the axes keep unit length
 
 
-def find_frame(splats: Splats, collection: PhotoCollection, splat: Path) -> Fit:
+def find_frame(splats: Splats, collection: Capture, splat: Path) -> Fit:
     """Find the frame in which renderings at the photos' cameras look like the photos.
 
     The frames that programs use are tried first (`known_frames`, by the splat's file), then those from the
@@ -142,7 +142,7 @@ class _Compared:
         return drawn, self.gray.to(drawn), self.mask.to(drawn.device) & covered
 
 
-def _compared(collection: PhotoCollection, count: int, side: int) -> list[_Compared]:
+def _compared(collection: Capture, count: int, side: int) -> list[_Compared]:
     """Read some photos, evenly spread from the first to the last, at a longer side of `side` pixels, without
     those that are damaged, and without damaged masks. Raises UserError if all are."""
     found, last, trouble = list[_Compared](), len(collection.photos) - 1, None
@@ -219,7 +219,7 @@ def _correlation(
     return (a * b).sum() / (a.square().sum() * b.square().sum()).clamp_min(1e-12).sqrt()
 
 
-def side_by_side(splats: Splats, collection: PhotoCollection, fit: Fit) -> UInt8[Array, "h w 3"]:
+def side_by_side(splats: Splats, collection: Capture, fit: Fit) -> UInt8[Array, "h w 3"]:
     """Draw a photo beside the rendering at its camera, for a person to compare."""
     photo = collection.photos[len(collection.photos) // 2]
     camera = camera_in(fit.similarity, collection.reconstruction.photos[photo.name])

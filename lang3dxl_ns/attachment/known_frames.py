@@ -10,6 +10,7 @@ from numpy import ndarray as Array
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
+from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import DAMAGE
 from lang3dxl_ns.common.files import read_json
 from lang3dxl_ns.scene.colmap import Reconstruction
@@ -24,6 +25,10 @@ _OLD_Z_UP = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]]
 """Rotation from COLMAP's y down to z up in nerfstudio before 1.0."""
 _HALF_TURNS = {"x": np.diag([1.0, -1, -1, 1]), "y": np.diag([-1.0, 1, -1, 1]), "z": np.diag([-1.0, -1, 1, 1])}
 _STEPS, _POINTS, _GAUSSIANS = 30, 2_000, 20_000
+_FEWEST = 50
+"""Smallest number of points, and of Gaussians, that are aligned by shape."""
+_MOST_SHRUNK = 1e-3
+"""Size of a fitted shape, relative to the splat's, below which the fit is a collapse."""
 
 
 def known_frames(reconstruction: Reconstruction, splat: Path) -> dict[str, Similarity]:
@@ -56,7 +61,8 @@ def _of_run(splat: Path) -> dict[str, Similarity]:
 def _turned(axes: Float[Array, "n 3"], target: tuple[int, int, int]) -> Similarity:
     """Compute the smallest rotation that takes the mean of some directions to another direction."""
     turn, mean = np.eye(4), axes.mean(axis=0)
-    turn[:3, :3] = Rotation.align_vectors([target], [mean / max(np.linalg.norm(mean), 1e-12)])[0].as_matrix()
+    if (length := np.linalg.norm(mean)) > 1e-9:  # opposite directions have no mean
+        turn[:3, :3] = Rotation.align_vectors([target], [mean / length])[0].as_matrix()
     return turn
 
 
@@ -96,8 +102,10 @@ def _gsplat(poses: Float[Array, "n 4 4"], points: Float[Array, "m 3"]) -> dict[s
 
 def registered_frames(points: Float[Array, "m 3"], means: Float[Array, "n 3"]) -> dict[str, Similarity]:
     """Register the photos' points to the Gaussians by iterated closest points from many rotations, and return
-    the three closest similarities. With fewer than 50 points or Gaussians there are none."""
-    if len(points) < 50 or len(means) < 50:
+    the three closest similarities. With fewer than 50 points or Gaussians there are none, and for flat or
+    thin shapes there may be none; a message says so."""
+    if len(points) < _FEWEST or len(means) < _FEWEST:
+        say(f"too few to align by shape: {len(points)} points of the photos, {len(means)} opaque Gaussians")
         return {}
     chosen = np.random.default_rng(0)
     source, target = (
@@ -106,7 +114,10 @@ def registered_frames(points: Float[Array, "m 3"], means: Float[Array, "n 3"]) -
     )
     tree, starts = KDTree(target), Rotation.create_group("O").as_matrix()
     fits = sorted((_closest(source, target, tree, start) for start in starts), key=lambda fit: fit[0])
-    return {f"by its shape, {i + 1}": fit for i, (_, fit) in enumerate(fits[:3])}
+    found = {f"by its shape, {i + 1}": fit for i, (score, fit) in enumerate(fits[:3]) if np.isfinite(score)}
+    if not found:
+        say("the splat can't be aligned to the photos' points by its shape, which is flat or thin")
+    return found
 
 
 def _typical(points: Float[Array, "m 3"]) -> Float[Array, "k 3"]:
@@ -122,16 +133,20 @@ def _closest(
     from skimage.transform import estimate_transform  # takes a second to import
 
     (a, from_axes, small), (b, to_axes, size) = map(_principal, (source, target))
-    fit, distance = np.eye(4), np.inf
+    fit, distance, size = np.eye(4), np.inf, max(size, 1e-12)
     fit[:3, :3] = size / max(small, 1e-12) * to_axes @ turn @ from_axes.T
     fit[:3, 3] = b - fit[:3, :3] @ a
     for _ in range(_STEPS):
         near, rows = tree.query(source @ fit[:3, :3].T + fit[:3, 3])
         kept = near <= np.quantile(near, 0.8)
         distance = float(near[kept].mean() / size)
-        fit = estimate_transform("similarity", source[kept], target[rows[kept]]).params
+        found = estimate_transform("similarity", source[kept], target[rows[kept]])
+        if not found or not np.isfinite(found.params).all():  # places in a line, or in one point
+            return np.inf, fit
+        fit = found.params
     # A fit that shrinks everything onto one place is close, too, so shrinking is penalized.
-    return distance * max(1.0, size / max(small * np.cbrt(np.linalg.det(fit[:3, :3])), 1e-12)), fit
+    shrunk = small * np.cbrt(np.linalg.det(fit[:3, :3])) / size
+    return (distance * max(1.0, 1 / shrunk) if shrunk > _MOST_SHRUNK else np.inf), fit
 
 
 def _principal(points: Float[Array, "m 3"]) -> tuple[Float[Array, "3"], Float[Array, "3 3"], float]:

@@ -19,7 +19,7 @@ from lang3dxl_ns.components.feature_decoder import Decoder
 from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
 from lang3dxl_ns.preparation.encoders import CLIP_OPTION, find_model, usual_dense
 from lang3dxl_ns.preparation.foreground import with_foreground
-from lang3dxl_ns.preparation.photo_collection import PhotoCollection
+from lang3dxl_ns.preparation.model_files import usual_clip
 from lang3dxl_ns.preparation.physical_scale import plan_crops
 from lang3dxl_ns.preparation.prepare import prepare
 from lang3dxl_ns.preparation.settings import PreparationConfig
@@ -27,6 +27,7 @@ from lang3dxl_ns.preparation.store import FeatureStore
 from lang3dxl_ns.preparation.targets import TargetReader
 from lang3dxl_ns.rendering import Splats, composite
 from lang3dxl_ns.scene.camera import Camera, camera_to_world, resized
+from lang3dxl_ns.scene.capture import Capture
 from lang3dxl_ns.scene.photo import Photo
 from lang3dxl_ns.scene.record import ScenePhoto, SceneRecord
 from lang3dxl_ns.training.learn_codes import TargetView, learn_codes
@@ -36,13 +37,14 @@ LONGER_SIDE = 800
 
 
 def settled(config: PreparationConfig) -> PreparationConfig:
-    """Return the settings for gathering features: fine crops, and the dense encoder that the CLIP needs."""
+    """Return the settings for gathering features: fine crops, the CLIP at hand, and its dense encoder."""
+    config = replace(config, clip=usual_clip(config.clip))
     return replace(config, dense=usual_dense(config, False), regions="none", crops="fine")
 
 
 def prepare_photos(
-    collection: PhotoCollection, config: PreparationConfig, cache: Path, device: torch.device | str
-) -> tuple[PhotoCollection, TargetReader]:
+    collection: Capture, config: PreparationConfig, cache: Path, device: torch.device | str
+) -> tuple[Capture, TargetReader]:
     """Prepare the photos' foreground and targets with `settled` settings, in the folder `cache`, where
     training also finds them. Photos that cannot be read are left out."""
     photos = [photo.at_most(config.longer_side) for photo in collection.photos]
@@ -55,7 +57,7 @@ def prepare_photos(
 
 
 def learn(
-    splats: Splats, collection: PhotoCollection, cameras: Mapping[str, Camera], targets: TargetReader
+    splats: Splats, collection: Capture, cameras: Mapping[str, Camera], targets: TargetReader
 ) -> tuple[Decoder, Float[Tensor, "n code"]]:
     """Learn a decoder and the Gaussians' codes, which are NaN for Gaussians that no photo shows, on the
     splat's device. `cameras` holds the photos' cameras in the splat's frame."""
@@ -87,7 +89,7 @@ def _views(
 
 
 def scene_file(
-    collection: PhotoCollection,
+    collection: Capture,
     cameras: Mapping[str, Camera],
     similarity: Similarity,
     config: PreparationConfig,
@@ -107,4 +109,4 @@ def scene_file(
         scale=scale,
         transform=(similarity[:3] / scale).tolist(),
         data=str(collection.folder),
-    )
+    ).located(collection.photos)

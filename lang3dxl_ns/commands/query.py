@@ -39,7 +39,7 @@ _LEAST_PART = 1e-4
 _NEAREST = Image.Resampling.NEAREST
 _READ_BY: dict[str, tuple[str, ...]] = dict.fromkeys(("title", "credit", "license"), ("web", "scene_file"))
 _READ_BY |= dict.fromkeys(("text", "not_", "look"), ("out", "web"))
-_READ_BY |= {"vocabulary": ("web",), "all": ("out",)}
+_READ_BY |= {"vocabulary": ("web",), "photos": ("web",), "all": ("out",), "hide_floaters": ("out", "web")}
 """Targets of `export` that read an option. Options that are not listed are read by every target."""
 _Not = Annotated[tyro.conf.UseAppendAction[list[str]], tyro.conf.arg(name="not")]
 
@@ -241,6 +241,8 @@ class Export:
     """Folder for a web page that any static server can serve."""
     vocabulary: Path | None = None
     """File of more words that may name a place on the page, one per line."""
+    photos: Path | None = None
+    """Folder of the scene's photos, of which the page shows small copies (default: none are published)."""
     scene_file: Path | None = None
     """Scene file to write, NAME.scene."""
     title: str = ""
@@ -251,6 +253,8 @@ class Export:
     """Terms under which photos and scene may be used."""
     all: bool = False
     """Write all Gaussians. With --text, a .ply has their relevancy as a property."""
+    hide_floaters: bool = False
+    """Leave out Gaussians that float where no surface is, and the sky's. A page opens with them hidden."""
     index: Path | None = None
     """File (.npy or .txt) for the indices of the matching Gaussians, in the order of the scene, which is also
     the order of the splat that it was attached to. It needs --text and --out."""
@@ -288,7 +292,9 @@ class Export:
             say(f"Wrote {size / 1e6:.1f} MB to {self.scene_file}; ask it: {ask}")
         if self.web is not None:
             own = read_names(self.vocabulary, "words") if self.vocabulary else ()
-            page = Page(scene, prompts, own, self._clip_words(scene.file.clip), self._told(), self.look)
+            words = self._clip_words(scene.file.clip)
+            page = Page(scene, prompts, own, words, self._told(), self.look, self.photos)
+            page.hide_floaters = self.hide_floaters
             size = write_page(page, self.web)
             for left_out in page.left_out:
                 say(f"{left_out}.")
@@ -296,7 +302,14 @@ class Export:
             say(f"Wrote {size / 1e6:.1f} MB to {self.web}; see it: {see}")
         if self.out is not None:
             text = prompts[0] if prompts else None
-            count = scene.export(self.out, text, everything=self.all, look=self.look, index=self.index)
+            count = scene.export(
+                self.out,
+                text,
+                everything=self.all,
+                look=self.look,
+                index=self.index,
+                hide_floaters=self.hide_floaters,
+            )
             say(f"Wrote {count} of {len(scene.splats)} Gaussians to {self.out}")
 
     def _clip_words(self, clip: str | None) -> tuple[str, ...]:

@@ -13,7 +13,7 @@ from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.settings_help import showing
 
 
-@showing("scene", "text", "host", "port", "clip")
+@showing("scene", "text", "photos", "host", "port", "clip")
 @dataclass(kw_only=True)
 class View:
     """Explore and query a scene in a browser.
@@ -26,6 +26,8 @@ class View:
     """A .scene file, a folder that holds one, or a run (default: the newest run under outputs/)."""
     text: tyro.conf.UseAppendAction[list[str]] = field(default_factory=list)
     """Prompt to start with. Repeat the flag, or separate prompts with `;`."""
+    photos: Path | None = None
+    """Folder of the scene's photos, to be shown over the rendering (default: the run's, if it is there)."""
     host: str = "127.0.0.1"
     """Address to serve at. 0.0.0.0 opens it to the network, with the token shown in the terminal."""
     port: int | None = None
@@ -34,13 +36,17 @@ class View:
     """Name or folder of the scene's CLIP, if it is not where the scene file says."""
 
     def main(self) -> None:
-        from lang3dxl_ns.open_scene import load_scene, provenance_of
+        from lang3dxl_ns.open_scene import find_scene_file, load_scene, provenance_of
+        from lang3dxl_ns.web.photos import folder_of_run
         from lang3dxl_ns.web.serve import PageServer
+        from lang3dxl_ns.web.teach import PageWords
         from lang3dxl_ns.web.write_page import Page
 
         check_address(self.host, self.port)  # fail now rather than after the work
         scene = load_scene(self.scene, clip=self.clip)
-        page = Page(scene, self.text, provenance=provenance_of(self.scene), live=True)
+        file = find_scene_file(self.scene)
+        told, photos = provenance_of(self.scene), self.photos or folder_of_run(file)
+        page = Page(scene, self.text, provenance=told, photos=photos, live=True, own_words=PageWords(file))
         server = PageServer(page, self.host, self.port)
         who = "anyone with this address" if server.access.needs_token else "this machine only"
         say(f"Open {server.access.address} ({who}). Ctrl-C ends it.")
@@ -66,6 +72,7 @@ class Info:
             "Gaussians": f"{count:,}",
             "photos": f"{told['photos']}{', each with its lighting' if told['looks'] else ''}",
             "words": words,
+            "meters": told["scene"].georeference,
             "size": f"{told['bytes'] / 1e6:.2f} MB, {told['bytes'] / max(count, 1):.0f} bytes a Gaussian",
         }
         say(*(f"{name:10} {' '.join(str(value).split())}" for name, value in lines.items() if value))

@@ -15,6 +15,18 @@ DAMAGE = (
 """Exceptions raised when values are read that a damaged file does not have."""
 
 
+NO_NERFSTUDIO = (
+    "this needs nerfstudio, which is not installed: pip install -e '.[nerfstudio]' in the checkout, with "
+    "Python 3.10 to 3.12"
+)
+
+
+def misses_nerfstudio(error: BaseException) -> bool:
+    """Return whether an import failed because the extra `nerfstudio` is not installed."""
+    name = error.name if isinstance(error, ModuleNotFoundError) else None
+    return (name or "").partition(".")[0] in ("nerfstudio", "viser")
+
+
 class UserError(Exception):
     """Error in the user's data or settings. Commands print its message alone, which names the remedy."""
 

@@ -37,12 +37,14 @@ def check_regular(path: Path) -> None:
 
 
 def read_text(path: Path, most: int = _MOST_BYTES) -> str:
-    """Read UTF-8 text from a regular file. Raises OSError, or ValueError for more than `most` bytes."""
+    """Read UTF-8 text (or UTF-16 with a mark) from a regular file. Raises OSError, or ValueError for more
+    than `most` bytes."""
     with open_file(path) as file:
         content = file.read(most + 1)
     if len(content) > most:
         raise ValueError(f"it is larger than {most >> 20} MiB")
-    return content.decode("utf-8-sig")  # without the mark that Windows' editors put first
+    # Windows' editors put a mark first, and some of its programs write two bytes per character.
+    return content.decode("utf-16" if content[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig")
 
 
 def read_json(path: Path, most: int = _MOST_BYTES) -> Any:

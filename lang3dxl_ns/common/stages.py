@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections import deque
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 
@@ -11,6 +12,8 @@ from lang3dxl_ns.common.console import say
 
 _FIRST_ESTIMATE_S = 20.0
 """Seconds of a stage before its pace is trusted."""
+_WINDOW_S = 60.0
+"""Seconds over which the pace is measured: other programs come and go, and steps grow with the scene."""
 
 
 class Stages:
@@ -23,6 +26,8 @@ class Stages:
         self._shares = dict(shares)
         self._current: str | None = None
         self._start, self._tenths = 0.0, -1
+        self._recent: deque[tuple[float, float]] = deque()
+        """Moments of the last seconds, each with the fraction that was done; the stage's start is the first."""
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
@@ -37,6 +42,7 @@ class Stages:
         """End the present stage, if there is one, and announce another."""
         self.end()
         self._current, self._start, self._tenths = name, time.perf_counter(), -1
+        self._recent = deque([(self._start, 0.0)])
         say(self._announcement(name))
 
     def _announcement(self, name: str) -> str:
@@ -48,15 +54,19 @@ class Stages:
         self._current = None
 
     def progress(self, done: float) -> None:
-        """Say about how long everything that is left takes, once the pace is known and at every tenth of the
-        stage. `done` is the fraction of the stage, as far as this command does it."""
-        elapsed = time.perf_counter() - self._start
-        if self._current is None or int(10 * done) <= self._tenths or elapsed < _FIRST_ESTIMATE_S:
+        """Say about how long everything that is left takes at the pace of the last minute, once that is known
+        and at every tenth of the stage. `done` is the fraction of the stage, as far as this command does it."""
+        now = time.perf_counter()
+        self._recent.append((now, done))
+        while len(self._recent) > 2 and now - self._recent[1][0] > _WINDOW_S:
+            self._recent.popleft()
+        if self._current is None or int(10 * done) <= self._tenths or now - self._start < _FIRST_ESTIMATE_S:
             return
         self._tenths = int(10 * done)
         shares = list(self._shares.values())[list(self._shares).index(self._current) :]
         ahead = sum(shares[1:]) / shares[0]
-        left = elapsed / done * (1 - done + ahead)
+        before, done_before = self._recent[0]
+        left = (now - before) / max(done - done_before, 1e-9) * (1 - done + ahead)
         if self._tenths < 10:
             say(f"{self._current}: {100 * done:.0f} % done; {roughly(left)} left in all")
 

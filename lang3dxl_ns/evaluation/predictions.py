@@ -18,7 +18,7 @@ from lang3dxl_ns.common.files import expanded, read_array, slugs
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth
 from lang3dxl_ns.evaluation.layouts import PICTURES, check_shape, read_gray
 from lang3dxl_ns.evaluation.scores import Maps, MapScorer, resize_map, strongest_level
-from lang3dxl_ns.preparation.foreground import find_mask
+from lang3dxl_ns.scene.companions import companion
 
 _LARGEST = 1e30
 """Largest score taken as finite. The squares of larger ones overflow float32."""
@@ -106,7 +106,7 @@ def _key(truth: GroundTruth, photo: str) -> str:
 
 
 def _mask_file(folder: Path, photo: str) -> Path:
-    path = find_mask(folder, f"{photo}.png")
+    path = companion(folder, f"{photo}.png", (".png", ".jpg", ".jpeg", ".JPG", ".PNG"))
     if path is None:
         raise UserError(f"{folder} holds no mask of the photo {photo}: add it, white = keep")
     return path

@@ -34,7 +34,7 @@ from lang3dxl_ns.components.appearance import AppearanceConfig, AppearanceField
 from lang3dxl_ns.components.decoders import DecoderConfig, make_decoder
 from lang3dxl_ns.components.feature_decoder import Decoder
 from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
-from lang3dxl_ns.files.splat_file import log_scales, logits
+from lang3dxl_ns.files.activations import log_scales, logits
 from lang3dxl_ns.query.question import QueryConfig
 from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.query.text import EncodeTexts

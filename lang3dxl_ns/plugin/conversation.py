@@ -20,6 +20,7 @@ from lang3dxl_ns.query.scene import Scene, text_encoder
 from lang3dxl_ns.query.text import EncodeTexts, caution
 from lang3dxl_ns.rendering import Rendering
 from lang3dxl_ns.scene.record import SceneRecord
+from lang3dxl_ns.training.learn_codes import forget_words
 
 _LONGEST = 40
 """Most characters of a prompt in the summary."""
@@ -120,7 +121,7 @@ class Conversation:
                 )
             finally:
                 if learning:
-                    self.model.forget_gathered_codes()
+                    forget_words(self.model.run)
                 self.model.train(training)
 
     # ── answering: called by the render thread, which holds the lock ────────────────────────────────

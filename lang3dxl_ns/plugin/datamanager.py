@@ -19,7 +19,6 @@ from nerfstudio.data.datamanagers.full_images_datamanager import (
     FullImageDatamanagerConfig,
 )
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
-from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 from rich.markdown import Markdown
 from rich.markup import escape
@@ -27,18 +26,23 @@ from torch import Tensor
 
 from lang3dxl_ns.common.checks import check_numbers
 from lang3dxl_ns.common.device import to_device
-from lang3dxl_ns.common.errors import UserError, readable
+from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import expanded
 from lang3dxl_ns.common.memory import machine_memory
 from lang3dxl_ns.common.reports import part
 from lang3dxl_ns.common.settings_help import showing, without
-from lang3dxl_ns.plugin.dataparser import PhotoCollectionDataParserConfig, parser_for, recorded_scene
+from lang3dxl_ns.plugin.dataparser import (
+    PhotoCollectionDataParser,
+    PhotoCollectionDataParserConfig,
+    parser_for,
+    recorded_scene,
+)
 from lang3dxl_ns.plugin.inert_settings import OF_IMAGE_CACHES
-from lang3dxl_ns.plugin.nerfstudio_scenes import check_transforms, photos_of, reconstruction_of
+from lang3dxl_ns.plugin.nerfstudio_scenes import photos_of, reconstruction_of
 from lang3dxl_ns.plugin.photo_dataset import EvalPhotos, PhotoDataset
 from lang3dxl_ns.preparation.encoders import usual_dense
 from lang3dxl_ns.preparation.foreground import foreground_kind, with_foreground
-from lang3dxl_ns.preparation.model_files import CLIP_OPTION, find_model
+from lang3dxl_ns.preparation.model_files import CLIP_OPTION, find_model, usual_clip
 from lang3dxl_ns.preparation.needs import Need, needs_table, scene_needs
 from lang3dxl_ns.preparation.photo_cache import PhotoCache, has_vanished
 from lang3dxl_ns.preparation.physical_scale import CropPlan, plan_crops
@@ -50,6 +54,7 @@ from lang3dxl_ns.preparation.targets import CLIP, DENSE, FINE, REGIONS, Batch, S
 from lang3dxl_ns.preparation.working_photos import PHOTO_MASKS, PHOTOS, WorkingPhotos
 from lang3dxl_ns.scene.camera import LONGEST_SIDE
 from lang3dxl_ns.scene.colmap import Reconstruction
+from lang3dxl_ns.scene.frame import Frame
 from lang3dxl_ns.scene.photo import Photo
 from lang3dxl_ns.scene.record import SCENE_FILE, ScenePhoto, SceneRecord
 
@@ -89,6 +94,7 @@ class Lang3DXLDataManagerConfig(PreparationConfig, FullImageDatamanagerConfig):
     def settle_targets(self, learned: bool, gathered: bool) -> None:
         """Resolve what is prepared: semantics `learned` with the scene use regions and targets in every step;
         features `gathered` onto Gaussians, also those that codes start from, need fine crops."""
+        self.clip = usual_clip(self.clip)
         self.targets_in_steps = learned
         if self.crops == "auto":
             self.crops = "fine" if gathered else "pyramid"
@@ -122,20 +128,15 @@ class Lang3DXLDataManager(FullImageDatamanager):
         self._gone = 0
         if config.data is not None:
             config.dataparser.data = Path(config.data)
+        # never find a run's own cameras anew: its Gaussians would not match them
+        config.dataparser = parser_for(config.dataparser, config.cache_dir, config.run is None)
         if isinstance(config.dataparser, PhotoCollectionDataParserConfig):
-            # never find a run's own cameras anew: its Gaussians would not match them
-            config.dataparser = parser_for(config.dataparser, config.cache_dir, config.run is None)
             config.data = config.dataparser.data
         if hasattr(config.dataparser, "load_3D_points"):
-            config.dataparser.load_3D_points = True  # off by default in nerfstudio-data
+            config.dataparser.load_3D_points = True  # off by default in some of nerfstudio's
         opens = kwargs.get("test_mode", "val") != "val"
         recorded = recorded_scene(config.run) if opens else None
         try:
-            check_transforms(config.dataparser)
-            if isinstance(config.dataparser, NerfstudioDataParserConfig):
-                # Read alone first (0.2 s for a thousand photos), so that no other error is called the file's.
-                with readable(f"nerfstudio can't read {config.dataparser.data}", "make it again"):
-                    config.dataparser.setup().get_dataparser_outputs("train")
             super().__init__(config, *args, **kwargs)
             if recorded is not None:
                 self._check_recorded(SceneRecord.read(recorded.run / SCENE_FILE))
@@ -150,10 +151,9 @@ class Lang3DXLDataManager(FullImageDatamanager):
     def _check_recorded(self, scene: SceneRecord) -> None:
         """Raise UserError if the photos are no longer those that the run was trained on: nerfstudio would
         find another frame for the cameras, or hold other photos out."""
-        outputs = self.train_dataparser_outputs
         names = [photo.name for photo in self.train_dataset.photos]
         trained = [photo.name for photo in scene.photos if photo.split == "train"]
-        known = scene.has_frame(outputs.dataparser_transform, outputs.dataparser_scale)
+        known = scene.has_frame(self.frame.transform, self.frame.scale)
         if not known or set(names) != set(trained):
             raise UserError(f"photos or cameras in {self.data_folder} are not those of the run's training")
 
@@ -264,7 +264,7 @@ class Lang3DXLDataManager(FullImageDatamanager):
     def scene_file(self, poses: Float[Tensor, "n 3 4"] | None = None) -> SceneRecord:
         """Describe the scene for the run's folder: photos, cameras and CLIP. `poses`: those of the training
         photos (default: unrefined)."""
-        outputs, clip = self.train_dataparser_outputs, self.config.clip
+        clip, frame = self.config.clip, self.frame
         known = None if clip == "none" else find_model(clip, CLIP_OPTION)
         trained = self._described(self.train_dataset, "train", poses)
         names = {photo.name for photo in trained}  # with --eval-mode all, the same photos are also held out
@@ -273,10 +273,10 @@ class Lang3DXLDataManager(FullImageDatamanager):
             photos=[*trained, *(photo for photo in held_out if photo.name not in names)],
             clip=None if known is None else known.address,
             clip_identity=None if known is None else known.identity,
-            scale=float(outputs.dataparser_scale),
-            transform=outputs.dataparser_transform.tolist(),
-            data=str(expanded(self.config.dataparser.data).absolute()),
-        )
+            scale=frame.scale,
+            transform=frame.transform.tolist(),
+            data=str(expanded(self.data_folder).absolute()),
+        ).located(self.photos.values())
 
     def _described(
         self, dataset: PhotoDataset, split: Literal["train", "eval"], poses: Tensor | None = None
@@ -292,6 +292,14 @@ class Lang3DXLDataManager(FullImageDatamanager):
         return data if data.is_dir() else data.parent
 
     @property
+    def frame(self) -> Frame:
+        """Similarity from the original coordinates to training's."""
+        outputs = self.train_dataparser_outputs
+        known = getattr(outputs, "frame", None)
+        transform = outputs.dataparser_transform.double().numpy()
+        return known if known is not None else Frame(transform, float(outputs.dataparser_scale))
+
+    @property
     def cache_dir(self) -> Path:
         """Folder of prepared targets."""
         return expanded(self.config.cache_dir or self.data_folder / "lang3dxl_cache")
@@ -299,9 +307,8 @@ class Lang3DXLDataManager(FullImageDatamanager):
     @cached_property
     def reconstruction(self) -> Reconstruction:
         """The model in its own units: COLMAP's, or else one made from the dataparser's seed points."""
-        own = getattr(self.dataparser, "reconstruction", None)
-        if own is not None:
-            return own
+        if isinstance(self.dataparser, PhotoCollectionDataParser):
+            return self.dataparser.capture.reconstruction
         return reconstruction_of([self.train_dataparser_outputs, self.eval_dataset._dataparser_outputs])
 
     @cached_property

@@ -18,7 +18,7 @@ from numpy import ndarray as Array
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.worker import Worker
 from lang3dxl_ns.plugin.conversation import Conversation, plain
-from lang3dxl_ns.plugin.viewer_guard import Guard, guard_viewers
+from lang3dxl_ns.plugin.viewer_guard import guard_viewers
 from lang3dxl_ns.query.match import Found
 from lang3dxl_ns.scene.camera import Camera
 from lang3dxl_ns.scene.record import overview
@@ -49,24 +49,19 @@ class AskPanel(ViewerControl):
 
     def _setup(self, viewer: Viewer) -> None:
         super()._setup(viewer)
-        guard: Guard = self.viser_server._websock_server.guard  # type: ignore[attr-defined]
-        guard.public = viewer.config.make_share_url
         if viewer.config.max_num_display_images == ViewerConfig().max_num_display_images:
             # A viewer at a photo's position would see only that photo's frame, and ns-viewer would read all
             # photos.
             viewer.config.max_num_display_images = 0
         if viewer.trainer is None:
             viewer.pause_train.visible = False  # nothing can be paused
-        self._leave_out_logo(guard.public)
+        self._leave_out_logo()
         gui, model = self.viser_server.gui, self._model
         with gui.add_folder("Ask the scene", order=-1):
             if model.semantic_field is None:
                 gui.add_markdown(NO_SEMANTICS)
             else:
                 self._add_question()
-            with gui.add_folder("Who can open this page", expand_by_default=False):
-                gui.add_markdown(guard.who_may_look)
-        CONSOLE.print(guard.who_may_look.replace("`", ""), soft_wrap=True, highlight=False)
         self._photos = [photo for photo in self._pipeline.scene_file.photos if photo.split == "train"]
         self.viser_server.on_client_connect(self._welcome)
         if model.semantic_field is not None:
@@ -98,7 +93,7 @@ class AskPanel(ViewerControl):
         if self._pipeline.query:
             self._question.value = self._pipeline.query
 
-    def _leave_out_logo(self, share: bool) -> None:
+    def _leave_out_logo(self) -> None:
         """Show nerfstudio's title bar without its logo, which would be loaded from the Internet."""
         address = "https://docs.nerf.studio"
         button = viser.theme.TitlebarButton(text="nerfstudio", icon="Description", href=address)
@@ -106,7 +101,7 @@ class AskPanel(ViewerControl):
             titlebar_content=viser.theme.TitlebarConfig(buttons=(button,), image=None),
             control_layout="collapsible",
             dark_mode=True,
-            show_share_button=share,
+            show_share_button=False,
         )
 
     # ── asking ──────────────────────────────────────────────────────────────────────────────────────

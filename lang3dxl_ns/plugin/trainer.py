@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
+from statistics import median
 from time import perf_counter
 from types import FrameType
 from typing import Any, Literal
@@ -23,7 +24,6 @@ from nerfstudio.utils import writer
 from nerfstudio.utils.decorators import check_main_thread
 from nerfstudio.utils.rich_utils import CONSOLE
 from rich.markup import escape
-from torch import Tensor
 from torch.cuda.amp.grad_scaler import GradScaler
 
 from lang3dxl_ns.common.console import say, some
@@ -34,13 +34,15 @@ from lang3dxl_ns.common.memory import ran_out_of_memory
 from lang3dxl_ns.common.reports import synchronize
 from lang3dxl_ns.common.stages import Stages, roughly
 from lang3dxl_ns.files.scene_file import SUFFIX, Provenance, replace_scene
-from lang3dxl_ns.plugin.optimizers import GuardedOptimizers, add_rows_to_state
+from lang3dxl_ns.plugin.optimizers import GuardedOptimizers
 from lang3dxl_ns.plugin.pipeline import Lang3DXLPipeline
 from lang3dxl_ns.plugin.run_checkpoint import NOT_A_CHECKPOINT, check_checkpoint, read_checkpoint
-from lang3dxl_ns.plugin.sizes import plan
 from lang3dxl_ns.preparation.needs import NEEDS_FILE, write_needs
 from lang3dxl_ns.preparation.store import PhotosGoneError
 from lang3dxl_ns.scene.record import SCENE_FILE, SceneRecord
+from lang3dxl_ns.training.learn_codes import forget_words
+from lang3dxl_ns.training.learning_rates import add_rows_to_state
+from lang3dxl_ns.training.memory import plan
 from lang3dxl_ns.training.step_guard import StepGuard
 
 RENDERINGS_PER_STEP = {False: 3.0, True: 4.0}
@@ -158,7 +160,7 @@ class Lang3DXLTrainer(Trainer):
                 write_needs(self.pipeline.datamanager.needs, self.base_dir)
         model, cameras = self.pipeline.model, self.pipeline.datamanager.train_dataset.cameras
         pixels, wanted = int((cameras.width * cameras.height).max()), self.config.pipeline.model.max_gaussians
-        model.strategy.most, message = plan(model, pixels, torch.device(self.device), wanted)
+        model.run.densification.most, message = plan(model.run, pixels, torch.device(self.device), wanted)
         CONSOLE.log(escape(message))
         torch.manual_seed(self.config.machine.seed)
         if self._run_state is not None:
@@ -210,8 +212,7 @@ class Lang3DXLTrainer(Trainer):
         """Check that a checkpoint's photos are this run's. Raises UserError for another frame, and, if the
         cameras were `corrected` one by one, for other training photos."""
         data = self.pipeline.datamanager
-        new = data.train_dataparser_outputs
-        if not before.has_frame(new.dataparser_transform, new.dataparser_scale):
+        if not before.has_frame(data.frame.transform, data.frame.scale):
             raise UserError(f"{path} is of other photos, or of another reconstruction of them: train anew")
         splits = [{p.name: p.split for p in file.photos} for file in (before, data.scene_file())]
         trained = [[name for name, split in known.items() if split == "train"] for known in splits]
@@ -252,8 +253,8 @@ class Lang3DXLTrainer(Trainer):
         )
         # Densification accumulates the gradients of screen positions, which are just as broken, and scaled
         # alike.
-        self.pipeline.model.step_is_sound = sound
-        self.pipeline.model.strategy.loss_scale = scale
+        self.pipeline.model.run.step_is_sound = sound
+        self.pipeline.model.run.densification.loss_scale = scale
         return sound
 
     @property
@@ -282,7 +283,7 @@ class Lang3DXLTrainer(Trainer):
         self.step = max(self._last_iteration, 0)
         if self._start_step < total:
             self.words_are_learned = False  # the checkpoint's words will be out of date
-            self.pipeline.model.forget_gathered_codes()
+            forget_words(self.pipeline.model.run)
         try:
             self._announce_time()
             writer.GLOBAL_BUFFER.setdefault("step", self.step)  # the end reads it, also without any step
@@ -306,19 +307,22 @@ class Lang3DXLTrainer(Trainer):
     @torch.no_grad()
     def _announce_time(self) -> None:
         """Log how long training and learning words will take with the present Gaussians. The estimate comes
-        from rendering a photo's view for the second time, since the first may compile kernels."""
+        from the median of five renderings of a photo's view, since the first may compile kernels, and others
+        may wait for another program."""
         model, cameras = self.pipeline.model, self.pipeline.datamanager.train_dataset.cameras
         middle = int((cameras.width * cameras.height).flatten().argsort()[len(cameras) // 2])
         with self.train_lock:  # the viewer may render at the same time
             model.eval()
-            for _ in range(2):
+            times = []
+            for _ in range(5):
                 start = perf_counter()
                 model.get_outputs(cameras[middle : middle + 1])
                 synchronize()
-            rendering = perf_counter() - start
+                times.append(perf_counter() - start)
+            rendering = median(times)
             model.train()
         count, decoder = self.config.max_num_iterations, model.semantic_field
-        seconds, words = rendering * count * RENDERINGS_PER_STEP[model.learns_from_renderings], 0.0
+        seconds, words = rendering * count * RENDERINGS_PER_STEP[model.run.learns_from_renderings], 0.0
         line = f"training: {roughly(seconds)} for {count:,} iterations"
         if decoder is not None and decoder.needs_lifting:
             words = rendering * len(cameras) * RENDERINGS_PER_PHOTO
@@ -475,26 +479,11 @@ class Lang3DXLTrainer(Trainer):
 
 
 def _run_state(pipeline: Lang3DXLPipeline) -> dict[str, Any]:
-    """Collect densification statistics, whether codes have begun, the current round through the photos, and
-    the random generators' states, all in types that torch's weights-only loader accepts."""
-    return {
-        "strategy": {k: v for k, v in pipeline.model.strategy_state.items() if k != "rendered"},
-        "codes_have_begun": pipeline.model.codes_have_begun,
-        "photos": pipeline.datamanager.round_state(),
-        "random": torch.get_rng_state(),
-        "random_cuda": torch.cuda.get_rng_state_all() if torch.cuda.is_available() else [],
-    }
+    """Collect the run's progress and the current round through the photos."""
+    return pipeline.model.run.progress() | {"photos": pipeline.datamanager.round_state()}
 
 
 def _restore(pipeline: Lang3DXLPipeline, state: dict[str, Any]) -> None:
     """Restore `_run_state` on the pipeline's device, whichever device it was saved from."""
-    model = pipeline.model
-    model.strategy_state = {
-        name: value.to(model.device) if isinstance(value, Tensor) else value
-        for name, value in state["strategy"].items()
-    }
-    model.codes_have_begun = state["codes_have_begun"]
     pipeline.datamanager.restore_round(state["photos"])
-    torch.set_rng_state(state["random"])
-    if torch.cuda.is_available() and len(state["random_cuda"]) == torch.cuda.device_count():
-        torch.cuda.set_rng_state_all(state["random_cuda"])
+    pipeline.model.run.restore(state)

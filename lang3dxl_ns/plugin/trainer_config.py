@@ -28,12 +28,14 @@ from lang3dxl_ns.plugin.pipeline import Lang3DXLPipeline, Lang3DXLPipelineConfig
 from lang3dxl_ns.plugin.run_checkpoint import check_checkpoint, latest_checkpoint
 from lang3dxl_ns.plugin.run_settings import load_configs, no_config, read_settings
 from lang3dxl_ns.plugin.trainer import RENDERINGS_PER_STEP, Lang3DXLTrainer, requested_checkpoint
+from lang3dxl_ns.plugin.viewer_guard import ONLY_HERE
 from lang3dxl_ns.preparation.model_files import BUILTIN, check_encoders
 from lang3dxl_ns.preparation.needs import read_needs
 from lang3dxl_ns.rendering import Gaussians, gsplat_build, rasterize
 from lang3dxl_ns.scene.camera import Camera
 from lang3dxl_ns.scene.photo_folder import check_data
 from lang3dxl_ns.scene.record import SCENE_FILE
+from lang3dxl_ns.web.access import is_local
 
 LONG_RUN_S = 3_600.0
 """Seconds of training on a slow GPU rasterizer above which a run is refused."""
@@ -89,6 +91,8 @@ class Lang3DXLTrainerConfig(TrainerConfig):
         self.pipeline.datamanager.check()
         check_data(self.pipeline.datamanager.data or self.data)
         if self.is_viewer_enabled():
+            if self.viewer.make_share_url or not is_local(self.viewer.websocket_host):
+                raise UserError(f"--viewer.websocket-host, --viewer.make-share-url: {ONLY_HERE}")
             check_address(self.viewer.websocket_host, self.viewer.websocket_port)
         if self.pipeline.datamanager.run is None:  # a run's config.yml contains resolved values
             check_inert(self.pipeline.model, self.pipeline.datamanager, self.optimizers)
@@ -188,6 +192,8 @@ class Lang3DXLTrainerConfig(TrainerConfig):
         if not (run / "config.yml").is_file():
             return
         earlier: Any = read_config(run / "config.yml").pipeline
+        if self.pipeline.datamanager.clip == "auto":
+            self.pipeline.datamanager.clip = earlier.datamanager.clip
         earlier = earlier.model
         needs, mine = read_needs(run), self.pipeline.model
         for part in ("semantic_field", "appearance"):

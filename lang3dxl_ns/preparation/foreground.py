@@ -18,15 +18,14 @@ import torch
 
 from lang3dxl_ns.common.console import some, tracked
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.common.pictures import NoPictureError, gray_values, open_picture
+from lang3dxl_ns.common.pictures import NoPictureError, mask_values, open_picture
 from lang3dxl_ns.preparation.segmentation import find_text_segmenter, load_text_segmenter
 from lang3dxl_ns.preparation.settings import PreparationConfig
 from lang3dxl_ns.preparation.store import FeatureStore
 from lang3dxl_ns.preparation.working_photos import kept_picture, mask_png
-from lang3dxl_ns.scene.companions import companion, named_folder
+from lang3dxl_ns.scene.companions import named_folder
+from lang3dxl_ns.scene.masks import MaskFolder
 from lang3dxl_ns.scene.photo import Photo
-
-MASK_SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".PNG")
 
 _LONGER_SIDE = 1024
 """Longer side in pixels of photos in which prompts are searched; the networks take no more anyway."""
@@ -48,7 +47,7 @@ def with_foreground(
 ) -> list[Photo]:
     """Return the photos with the masks configured in `config.foreground` (a folder is relative to `data`),
     and log the photos without one. Raises UserError if a folder is missing or matches no photo, if masks are
-    damaged or all black, and if a model can't be loaded."""
+    damaged or all dark, and if a model can't be loaded."""
     if config.foreground == "none":
         return [replace(photo, mask_path=None) for photo in photos]
     if config.foreground == "text":
@@ -57,7 +56,8 @@ def with_foreground(
         masked = list(photos)  # with the masks found by the dataparser
     else:
         folder = named_folder(config.foreground, data, "foreground")
-        masked = [replace(photo, mask_path=find_mask(folder, photo.name)) for photo in photos]
+        masks = MaskFolder(folder)
+        masked = [replace(photo, mask_path=masks.find(photo.name)) for photo in photos]
         if all(photo.mask_path is None for photo in masked):
             raise UserError(
                 f"no mask in {folder} is named like a photo (the first is {photos[0].name}): name masks like "
@@ -81,14 +81,15 @@ def with_foreground(
 
 
 def _checked(photos: list[Photo], skip: bool, log: Log) -> list[Photo]:
-    """Read all masks, log the black ones, and return the photos. Unreadable masks raise one UserError that
+    """Read all masks, log the dark ones, and return the photos. Unreadable masks raise one UserError that
     names them all; with `skip`, they are logged, and their photos count whole. Raises UserError if all masks
-    are black."""
+    are dark."""
     masked = [photo for photo in photos if photo.mask_path is not None]
     with ThreadPoolExecutor(_READERS) as pool:
         states = list(tracked(pool.map(_state, masked), "checking masks", len(masked)))
     damaged = {p.name: state for p, state in zip(masked, states, strict=True) if isinstance(state, str)}
-    black = [photo.name for photo, state in zip(masked, states, strict=True) if state is False]
+    brightest = dict(zip((photo.name for photo in masked), states, strict=True))
+    dark = {name: value for name, value in brightest.items() if isinstance(value, int) and value < 128}
     if damaged and not skip:
         raise UserError(
             f"{len(damaged)} masks can't be read: {'; '.join(damaged.values())}. Replace or remove them, or "
@@ -96,29 +97,27 @@ def _checked(photos: list[Photo], skip: bool, log: Log) -> list[Photo]:
         )
     if damaged:
         log(f"{len(damaged)} masks can't be read, and their photos count whole: {some(list(damaged))}")
-    if black and len(black) == len(photos):
+    if dark and len(dark) == len(photos):
+        most = max(dark.values())
+        how = f"dark (the brightest pixel has {most} of 255)" if most else "black"
         raise UserError(
-            f"all {len(black)} masks are black: nothing would count; white is what to keep: invert them, or "
-            "pass --pipeline.datamanager.foreground none"
+            f"all {len(dark)} masks are {how}: nothing would count, since white (255) is what to keep. Draw "
+            "it "
+            "white, or pass --pipeline.datamanager.foreground none"
         )
-    if black:
-        log(f"the masks of {len(black)} photos are all black, nothing in them counts: {some(black)}")
+    if dark:
+        log(f"the masks of {len(dark)} photos are black or dark, nothing in them counts: {some(list(dark))}")
     return [replace(photo, mask_path=None) if photo.name in damaged else photo for photo in photos]
 
 
-def _state(photo: Photo) -> bool | str:
-    """Return whether a photo's mask keeps anything, or the reason why it can't be read."""
+def _state(photo: Photo) -> int | str:
+    """Return the largest value of a photo's mask, or the reason why it can't be read."""
     assert photo.mask_path is not None
     try:
         with open_picture(photo.mask_path) as image:
-            return bool(np.asarray(gray_values(image)).max() >= 128)
+            return int(np.asarray(mask_values(image)).max())
     except (OSError, NoPictureError) as error:
         return f"{photo.mask_path} ({error})"
-
-
-def find_mask(folder: Path, name: str, follow_links: bool = False) -> Path | None:
-    """Find a photo's mask in a folder, a PNG or JPEG that is named like the photo."""
-    return companion(folder, name, MASK_SUFFIXES, follow_links)
 
 
 def foreground_kind(config: PreparationConfig) -> str:

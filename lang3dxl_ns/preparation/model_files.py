@@ -22,6 +22,8 @@ DENSE_OPTION = "--pipeline.datamanager.dense"
 
 BUILTIN = "builtin"
 """Name of the small encoders that ship with this package."""
+USUAL_CLIP = "openai/clip-vit-base-patch32"
+"""CLIP that "auto" chooses where it was downloaded before."""
 _PREFIX = "--pipeline.datamanager."
 option_prefix: ContextVar[str] = ContextVar("option_prefix", default=_PREFIX)
 """Prefix of the options in the current command; `lang3dxl prepare` has none."""
@@ -63,6 +65,17 @@ def find_model(name_or_dir: str | Path, option: str) -> ModelFiles:
     else:
         folder = local if local.is_dir() else _download(name, option)
     return ModelFiles(name, folder, _fingerprint(folder, option), option)
+
+
+def usual_clip(clip: str) -> str:
+    """Resolve the image-text encoder "auto": OpenAI's CLIP if it is in the Hugging Face cache, otherwise the
+    built-in one, so that nothing is downloaded unasked. Another name is returned as it is."""
+    from huggingface_hub import try_to_load_from_cache
+
+    if clip != "auto":
+        return clip
+    files = (try_to_load_from_cache(USUAL_CLIP, n) for n in ("model.safetensors", "pytorch_model.bin"))
+    return USUAL_CLIP if any(isinstance(file, str) for file in files) else BUILTIN
 
 
 class _NotDownloaded(UserError):

@@ -43,6 +43,7 @@ from lang3dxl_ns.preparation.model_files import (
     BUILTIN,
     CLIP_OPTION,
     DENSE_OPTION,
+    USUAL_CLIP,
     find_model,
     read_config,
     spoken,
@@ -134,8 +135,8 @@ def prepare(
         store.remove_leftovers()
         if config.clip == BUILTIN:
             say(
-                "The built-in CLIP knows landmarks and street façades and nothing else; a real one knows "
-                f"more: {spoken(CLIP_OPTION)} openai/clip-vit-base-patch32"
+                "Using the built-in CLIP, which knows landmarks and street façades and nothing else. For any "
+                f"word: {spoken(CLIP_OPTION)} {USUAL_CLIP} (a download of 600 MB)"
             )
         maker.announce(len(tasks), str(device))
         made = workers.run(config, maker.start, missing, str(device))

@@ -39,9 +39,10 @@ class PreparationConfig:
     quality: Quality = "normal"
     """Number of crops. normal: at most 2,500 per photo for an encoder of 224 pixels (as many pixels for other
     encoders). fast: at most 700. fine: no bound, about 10,000 in a photo of 1,600 pixels."""
-    clip: str = "openai/clip-vit-base-patch32"
+    clip: str = "auto"
     """CLIP, SigLIP or another image-text encoder (docs/encoders.md) in Hugging Face format: a name, a folder,
-    or "builtin". Queries need the same one. The paper uses the default, fine-tuned on landmarks."""
+    or "builtin". auto: openai/clip-vit-base-patch32 if it was downloaded before, otherwise the built-in one.
+    The paper uses the former, fine-tuned on landmarks."""
     clip_features: ClipFeatures = "auto"
     """How the image-text encoder reads photos. crops: one vector for each of thousands of crops. dense: a map
     of patch features in about ten passes. auto: dense if its patches were trained to match texts (TIPSv2),

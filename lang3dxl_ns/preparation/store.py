@@ -7,7 +7,6 @@ import errno
 import hashlib
 import json
 import logging
-import os
 import re
 import time
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
@@ -29,7 +28,6 @@ _HALF_MAX = torch.finfo(torch.float16).max
 _ENTRY = re.compile(r".+\.[0-9a-f]{16}\.(safetensors|png|jpg)")
 """Names of targets, masks, and photos at working size. Nothing else is ever deleted."""
 _HASHES = "photo_hashes.json"
-_SECOND = 10**9  # nanoseconds
 _LEFTOVER_AGE_S = 3600.0
 """Age in seconds from which a temporary file is a leftover of a killed process; a write takes seconds."""
 _READERS = 4
@@ -66,7 +64,6 @@ class FeatureStore:
         metadata = {"settings": _canonical(settings), "checksum": checksum}
         path = self.path(kind, name)
         self.write_bytes(path, save(stored, metadata=metadata), f"{name} ({kind})")
-        _seal(path)
 
     def write_bytes(self, path: Path, content: bytes, what: str) -> None:
         """Write a file of the store atomically. Raises UserError if the disk is full or read-only."""
@@ -118,9 +115,8 @@ class FeatureStore:
             return json.loads(file.metadata()["settings"])
 
     def is_current(self, kind: str, name: str, settings: dict[str, Any]) -> bool:
-        """Return whether the entry exists, is complete, and was made with these settings. A damaged one
-        counts as absent. Only the header is read, unless the file has changed since it was last found
-        complete."""
+        """Return whether the entry exists, matches its checksum, and was made with these settings. A damaged
+        one counts as absent."""
         path = self.path(kind, name)
         if not path.exists():
             return False
@@ -129,12 +125,9 @@ class FeatureStore:
                 metadata = file.metadata()
                 if _canonical(json.loads(metadata["settings"])) != _canonical(settings):
                     return False
-                if path.stat().st_mtime_ns % _SECOND == 0:  # sealed
-                    return True
                 tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
                 if metadata.get("checksum") != hash_tensors(hashlib.blake2b(digest_size=16), tensors):
                     raise UserError(f"{path} ({kind} of {name}) is damaged: its checksum differs")
-            _seal(path)
             return True
         except (UserError, ValueError) as error:
             logger.warning("%s; it will be made again", error)
@@ -227,13 +220,6 @@ def hash_tensors(digest: Any, tensors: Mapping[str, Tensor]) -> str:
         digest.update(f"{name} {value.dtype} {list(value.shape)}".encode())
         digest.update(value.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy().data)
     return digest.hexdigest()
-
-
-def _seal(path: Path) -> None:
-    """Mark a file as complete by a modification time in full seconds, which a later change replaces."""
-    with contextlib.suppress(OSError):
-        seconds = path.stat().st_mtime_ns // _SECOND
-        os.utime(path, ns=(seconds * _SECOND, seconds * _SECOND))
 
 
 def _canonical(settings: dict[str, Any]) -> str:

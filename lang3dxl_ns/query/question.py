@@ -6,7 +6,6 @@ restriction to a foreground are therefore decided here and nowhere else.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -18,21 +17,16 @@ from torch import Tensor
 from lang3dxl_ns.common.checks import check_numbers
 from lang3dxl_ns.common.image import resize_nearest
 from lang3dxl_ns.common.settings_help import showing
-from lang3dxl_ns.query.doubt import DOUBTFUL, peaks
 from lang3dxl_ns.query.engine import QueryEngine
 from lang3dxl_ns.query.heat_maps import overlay, strongest
 from lang3dxl_ns.query.relevancy import TEMPERATURE, Queries
 from lang3dxl_ns.query.text import Prompt, TextConfig
+from lang3dxl_ns.query.thresholds import matching
 from lang3dxl_ns.query.trust import Trust
 from lang3dxl_ns.rendering import Rendering
 
-EVEN = 0.5
-"""Relevancy where prompt and negatives match equally well."""
-SHARE = 0.3
-"""Where matches begin, as a fraction of the way from the median Gaussian's relevancy to a prompt's peak.
-Tuned on the validation landmarks (docs/lab/words.md)."""
 COVERED = 0.3
-"""Share of a pixel that matching Gaussians must cover; under half, as most are small and edges blend."""
+"""Share of a pixel that matching Gaussians must cover; below 0.5, because most are small and edges blend."""
 _BOUNDS = {
     "temperature": (1e-3, 1e4),
     "threshold": (0, 1),
@@ -70,28 +64,6 @@ class QueryConfig:
     def __post_init__(self) -> None:
         """Raise UserError if an option is invalid."""
         check_numbers(self, _BOUNDS)
-
-
-def match_thresholds(
-    relevancy: Float[Tensor, "q n"], doubts: Sequence[float], named: Sequence[bool]
-) -> tuple[float, ...]:
-    """Compute for each prompt the relevancy above which Gaussians match.
-
-    Small and thin things blur with their surroundings in CLIP's crops, and seldom beat every negative there.
-    So the threshold is relative to the scene, and never above `EVEN`. Doubtful prompts use `EVEN`, because
-    their peaks carry no information. So do the `named` ones, which have negatives of their own to beat.
-    """
-    if relevancy.shape[1] == 0:
-        return (EVEN,) * len(relevancy)
-    low = relevancy.median(dim=1).values
-    levels = (low + SHARE * (peaks(relevancy) - low)).clamp_max(EVEN).tolist()
-    strict = [doubt > DOUBTFUL or names for doubt, names in zip(doubts, named, strict=True)]
-    return tuple(EVEN if one else level for one, level in zip(strict, levels, strict=True))
-
-
-def matching(maps: Float[Tensor, "q ..."], thresholds: Sequence[float]) -> Bool[Tensor, "q ..."]:
-    """Return where each prompt's relevancy exceeds its threshold."""
-    return maps > maps.new_tensor(list(thresholds)).view(-1, *[1] * (maps.dim() - 1))
 
 
 @dataclass(frozen=True, eq=False, repr=False)

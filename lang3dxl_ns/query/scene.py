@@ -28,10 +28,12 @@ from lang3dxl_ns.query import answer
 from lang3dxl_ns.query.answering import Place
 from lang3dxl_ns.query.doubt import DOUBTFUL, Doubts, doubtful, peaks
 from lang3dxl_ns.query.engine import QueryEngine, make_engine
+from lang3dxl_ns.query.floaters import FLOATS, floating
 from lang3dxl_ns.query.match import Found, Match, View
-from lang3dxl_ns.query.question import QueryConfig, Question, match_thresholds, matching
+from lang3dxl_ns.query.question import QueryConfig, Question
 from lang3dxl_ns.query.relevancy import Queries
 from lang3dxl_ns.query.text import EncodeTexts, Prompt, TextEncoder, listed_phrases, parse_prompts, texts_of
+from lang3dxl_ns.query.thresholds import match_thresholds, matching
 from lang3dxl_ns.query.trust import ANCHORS, alike, foreignness, judged
 from lang3dxl_ns.query.visibility import VisibleGaussians, measured, median_distance, total_pixels
 from lang3dxl_ns.query.vocabulary import closest_word, common_words, searched, shipped_vocabulary
@@ -363,6 +365,7 @@ class Scene:
         everything: bool = False,
         look: str | None = None,
         index: str | Path | None = None,
+        hide_floaters: bool = False,
     ) -> int:
         """Write the Gaussians as a .ply or .spz file for splat viewers, in the scene's order, and return how
         many were written.
@@ -374,15 +377,19 @@ class Scene:
             look: training photo whose lighting is baked into the colors; default: the overview photo.
             index: with a text, a .npy or .txt file for the numbers of the matching Gaussians: their
                 positions, from 0, in the scene, and so in the splat that it was attached to.
+            hide_floaters: leave out the Gaussians that `floating` takes for floaters.
 
         Raises:
             UserError: nothing matches, or see `ask` and `write_splats`.
         """
         splats = self.baked(look)
+        solid = self.floating <= FLOATS if hide_floaters else self.splats.opacities >= 0
         if text is None:
-            return write_splats(expanded(path), splats)
+            return write_splats(expanded(path), splats.select(solid) if hide_floaters else splats)
         question = self._one(text, threshold)
-        return write_matching(expanded(path), splats, question, everything, index)
+        return write_matching(
+            expanded(path), splats, question, everything, index, solid if hide_floaters else None
+        )
 
     # ── what the photos show ────────────────────────────────────────────────────────────────────────
 
@@ -408,6 +415,11 @@ class Scene:
     def mass(self) -> Float[Tensor, " n"]:
         """Pixels that every Gaussian fills, summed over all views."""
         return total_pixels(self.visible, self.splats.means)
+
+    @cached_property
+    def floating(self) -> Float[Tensor, " n"]:
+        """How surely each Gaussian is a floater, 0…1."""
+        return floating(self.splats, self.visible, self.draw)
 
     @cached_property
     def trained_side(self) -> int:

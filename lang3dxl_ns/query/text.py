@@ -17,8 +17,9 @@ from torch import Tensor
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.query.doubt import UNRELATED
 from lang3dxl_ns.query.language import meaning, phrases_of
+from lang3dxl_ns.query.negatives import NEGATIVES, competitors
 from lang3dxl_ns.query.relevancy import Queries
-from lang3dxl_ns.query.vocabulary import NEGATIVES, competitors, searched, synonyms_of
+from lang3dxl_ns.query.vocabulary import searched, synonyms_of
 from lang3dxl_ns.words.taught_words import TaughtWord, known_word
 
 EncodeTexts = Callable[[list[str]], Float[Tensor, "n c"]]

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from jaxtyping import Bool, Float, Float64
 from numpy import ndarray as Array
 from torch import Tensor
@@ -106,13 +107,39 @@ class HasLens:
 
 
 def check_pose(rows: Any) -> None:
-    """Check a pose from a file: a [3, 4] or [4, 4] nested list of finite numbers, whose rotation changes no
-    volume more than eightfold. Raises ValueError otherwise."""
+    """Check a pose from a file: a [3, 4] or [4, 4] nested list of finite numbers, a rotation (to a hundredth)
+    and a position. Raises ValueError otherwise."""
+    _, scale = rigid(rows)
+    expect(abs(scale - 1) < _UNIT, f"a pose's axes have the length {scale:.4g}, not 1")
+
+
+_UNIT = 0.01
+"""Deviation of a rotation's axes from unit length up to which it counts as rounded."""
+
+
+def rigid(rows: Any) -> tuple[Float64[Array, "3 4"], float]:
+    """Read a pose from a file: a [3, 4] or [4, 4] nested list of finite numbers. Its rotation may be scaled.
+
+    Returns:
+        the pose with the nearest rotation, and the scale of the given one.
+
+    Raises:
+        ValueError: it is something else, such as mirrored or stretched in one direction.
+    """
     in_rows = isinstance(rows, list) and all(isinstance(row, list) and len(row) == 4 for row in rows)
     numbers = in_rows and all(is_coordinate(value) for row in rows for value in row)
     expect(numbers and len(rows) in (3, 4), "a pose is not three rows of four numbers")
-    turn = np.linalg.det(np.array([row[:3] for row in rows[:3]], dtype=np.float64))
-    expect(1 / 8 < turn < 8, "a pose is not a rotation and a position")
+    pose = np.array(rows, dtype=np.float64)
+    whole = len(pose) == 3 or bool(np.abs(pose[3] - [0, 0, 0, 1]).max() < 1e-6)
+    expect(whole, "a pose's last row is not 0, 0, 0, 1: it may be transposed")
+    left, sizes, right = np.linalg.svd(pose[:3, :3])
+    expect(sizes[2] > 1e-9, "a pose is not a rotation and a position")
+    expect(np.linalg.det(left @ right) > 0, "a pose is mirrored: its axes are left-handed")
+    lengths = " × ".join(f"{size:.3g}" for size in sizes)
+    expect(
+        sizes[0] < (1 + _UNIT) * sizes[2], f"a pose stretches space ({lengths}): its axes differ in length"
+    )
+    return np.column_stack([left @ right, pose[:3, 3]]), float(sizes.mean())
 
 
 @dataclass
@@ -244,3 +271,23 @@ def posed(pose: Float[Tensor, "rows 4"], like: Camera) -> Camera:
     except ValueError as error:
         raise UserError(f"{error}: give camera → world, such as the `pose` of a photo") from error
     return replace(like, view_matrix=view_matrix(pose[:3].float()))
+
+
+def level(up: Float[Tensor, "3"], turn: float = 0.0) -> Float[Tensor, "3"]:
+    """Return the direction perpendicular to `up` at a fraction of a full turn."""
+    first = F.one_hot(up.abs().argmin(), 3).to(up)
+    side = F.normalize(torch.linalg.cross(up, first), dim=0)
+    return math.cos(2 * math.pi * turn) * side + math.sin(2 * math.pi * turn) * torch.linalg.cross(up, side)
+
+
+def looking(
+    place: Float[Tensor, "3"], target: Float[Tensor, "3"], up: Float[Tensor, "3"]
+) -> Float[Tensor, "4 4"]:
+    """Build an upright camera's view matrix (world → camera, OpenCV axes) from its place and its target."""
+    forward = F.normalize(target - place, dim=0)
+    right = F.normalize(torch.linalg.cross(forward, up), dim=0)
+    down = torch.linalg.cross(forward, right)
+    view = torch.eye(4)
+    view[:3, :3] = torch.stack([right, down, forward])
+    view[:3, 3] = -view[:3, :3] @ place
+    return view

@@ -3,26 +3,22 @@
 from __future__ import annotations
 
 import signal
-import struct
 import threading
+from collections import Counter
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING
 
 import numpy as np  # before pycolmap: in the other order, Pillow's PNG writer aborts the process
 from jaxtyping import Float, UInt8
 from numpy import ndarray as Array
+from scipy.spatial.transform import Rotation
 
-from lang3dxl_ns.common.checks import FARTHEST
+from lang3dxl_ns.common.checks import FARTHEST, expect
 from lang3dxl_ns.common.console import say, some
 from lang3dxl_ns.common.errors import UserError, is_plain
-from lang3dxl_ns.common.files import open_file
 from lang3dxl_ns.scene.camera import HasLens, Lens, check_pose
-
-if TYPE_CHECKING:
-    import pycolmap
+from lang3dxl_ns.scene.colmap_files import ModelCamera, ModelFiles, ModelPhoto, read_model_files
 
 PERSPECTIVE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 FISHEYE_MODELS = ("SIMPLE_FISHEYE", "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE")
@@ -79,181 +75,84 @@ def load_pycolmap() -> ModuleType:
 def read_reconstruction(model_dir: Path) -> Reconstruction:
     """Read a COLMAP model (.bin or .txt) with its tracks. Raises UserError for a missing, damaged or empty
     one, and for a camera model that OpenCV can't undistort."""
-    model = _read_model(Path(model_dir))
-    images = {
-        name: image for i, image in model.images.items() if image.has_pose and (name := _name(i, image))
-    }
-    if not images:
+    files = read_model_files(Path(model_dir))
+    photos = [photo for photo in files.photos if _has_name(photo)]
+    if not photos:
         raise UserError(f"the COLMAP model in {model_dir} has no photo with a pose: run the mapper again")
+    names = [photo.name for photo in photos]
+    if twice := [name for name, count in Counter(names).items() if count > 1]:
+        raise UserError(f"the COLMAP model in {model_dir} lists {some(twice)} twice: remove one of the two")
     # Drop NaN, and coordinates whose squares overflow float32.
-    points = {i: point for i, point in model.points3D.items() if (np.abs(point.xyz) < FARTHEST).all()}
-    if len(points) < len(model.points3D):
-        say(f"{len(model.points3D) - len(points)} points of {model_dir} are invalid and skipped")
-    positions = {i: point.xyz for i, point in points.items()}
-    return Reconstruction(
-        photos={
-            name: _tracked_photo(images[name], model.cameras[images[name].camera_id], positions)
-            for name in sorted(images)
-        },
-        points=np.array(list(positions.values()), dtype=np.float64).reshape(-1, 3),
-        colors=np.array([point.color for point in points.values()], dtype=np.uint8).reshape(-1, 3),
-    )
+    sound = (np.abs(files.positions) < FARTHEST).all(axis=1)
+    if not sound.all():
+        say(f"{np.count_nonzero(~sound)} points of {model_dir} are invalid and skipped")
+    if files.colorless:
+        say(f"{files.colorless} points of {model_dir} have no color and are gray")
+    rows = dict(zip(files.numbers[sound].tolist(), range(int(sound.sum())), strict=True))
+    positions = files.positions[sound]
+    tracked = {photo.name: _tracked_photo(photo, files, rows, positions) for photo in photos}
+    return Reconstruction(dict(sorted(tracked.items())), positions, files.colors[sound])
 
 
-def _name(number: int, image: pycolmap.Image) -> str | None:
-    """Return a photo's name; if it can't be used, log the reason and return None."""
-    left_out = "of the COLMAP model is left out: its name"
-    try:
-        if is_plain(image.name):
-            return image.name
-        say(f"photo {some([image.name])} {left_out} has control characters; rename it")
-    except UnicodeDecodeError:
+def _has_name(photo: ModelPhoto) -> bool:
+    """Return whether a photo has a name that can be used; if not, log the reason."""
+    if is_plain(photo.name):
+        return True
+    if any("\ud800" <= character <= "\udfff" for character in photo.name):
         say(
-            f"photo {number} {left_out} is not UTF-8; rename its file (convmv -f latin1 -t utf8 --notest "
-            "images/*) and make the model again"
+            f"photo {photo.number} of the COLMAP model is left out: its name is not UTF-8; rename its file "
+            "(convmv -f latin1 -t utf8 --notest images/*) and make the model again"
         )
-    return None
+    else:
+        say(
+            f"photo {some([photo.name])} of the COLMAP model is left out: its name has control characters; "
+            "rename it"
+        )
+    return False
 
 
 def photos_in_model(model_dir: Path) -> int:
-    """Count the photos in a COLMAP model from the header or lines of its images file alone."""
-    binary, text = model_dir / "images.bin", model_dir / "images.txt"
-    if binary.is_file():
-        with binary.open("rb") as file:
-            return int.from_bytes(file.read(8), "little")
-    with text.open(errors="replace") as lines:
-        return sum(not line.startswith("#") for line in lines) // 2  # each is followed by a line of keypoints
-
-
-def _read_model(folder: Path) -> pycolmap.Reconstruction:
-    """Read pycolmap's model. Raises UserError with the reason if it can't be read."""
-    pycolmap = load_pycolmap()
-    parts = ("cameras", "images", "points3D")
-    if not any(all((folder / (part + ending)).is_file() for part in parts) for ending in (".bin", ".txt")):
-        raise UserError(
-            f"no COLMAP model in {folder}: looked for cameras, images and points3D, .bin or .txt. Give the "
-            "folder that holds them (usually sparse/0), or make one from photos: "
-            "lang3dxl reconstruct --data PHOTOS"
-        )
-    for path in (*folder.glob("*.bin"), *folder.glob("*.txt")):
-        if not path.is_file():
-            raise UserError(f"{path} is not a regular file: remove it, or copy the model again")
-    check_binary_model(folder)
+    """Count the photos in a COLMAP model; 0 if it can't be read."""
     try:
-        return pycolmap.Reconstruction(folder)
-    except (ValueError, IndexError, RuntimeError, UnicodeDecodeError, MemoryError) as error:
-        raise UserError(f"the COLMAP model in {folder} is damaged, copy or make it again: {error}") from error
+        return len(read_model_files(model_dir).photos)
+    except (UserError, OSError):
+        return 0
 
 
 def _tracked_photo(
-    image: pycolmap.Image, camera: pycolmap.Camera, positions: dict[int, Array]
+    photo: ModelPhoto, files: ModelFiles, rows: dict[int, int], positions: Float[Array, "m 3"]
 ) -> TrackedPhoto:
-    distortion, fisheye = _distortion(image.name, camera)
-    lens = Lens(
-        width=camera.width, height=camera.height, fx=camera.focal_length_x, fy=camera.focal_length_y,
-        cx=camera.principal_point_x, cy=camera.principal_point_y, distortion=distortion, fisheye=fisheye,
-    )  # fmt: skip
-    pose = image.cam_from_world().matrix()
+    camera = files.cameras.get(photo.camera)
+    if camera is None:
+        raise UserError(f"photo {photo.name} has the camera {photo.camera}, which the COLMAP model lacks")
+    distortion, fisheye = _distortion(photo.name, camera)
+    (fx, fy), (cx, cy) = camera.focal, camera.center
+    lens = Lens(camera.width, camera.height, fx, fy, cx, cy, distortion, fisheye)
+    length = float(np.linalg.norm(photo.quaternion))
     try:
         lens.check()
+        expect(1e-6 < length < FARTHEST, "its rotation is no quaternion")
+        turn = Rotation.from_quat(photo.quaternion[[1, 2, 3, 0]]).as_matrix()
+        pose = np.column_stack([turn, photo.translation])
         check_pose(pose.tolist())
     except ValueError as error:
         raise UserError(
-            f"photo {image.name} has an impossible camera ({error}), remove it from the model: {camera}"
+            f"photo {photo.name} has an impossible camera ({error}), remove it from the model: {camera}"
         ) from error
-    tracked = [point for point in image.get_observation_points2D() if point.point3D_id in positions]
-    points = np.array([positions[point.point3D_id] for point in tracked], dtype=np.float64).reshape(-1, 3)
-    pixels = np.array([point.xy for point in tracked], dtype=np.float64).reshape(-1, 2)
-    return TrackedPhoto(image.name, lens, pose, points, pixels)
+    chosen = np.array([rows.get(number, -1) for number in photo.points.tolist()], dtype=np.int64)
+    seen = chosen >= 0
+    return TrackedPhoto(photo.name, lens, pose, positions[chosen[seen]], photo.pixels[seen])
 
 
-def _distortion(name: str, camera: pycolmap.Camera) -> tuple[tuple[float, ...], bool]:
+def _distortion(name: str, camera: ModelCamera) -> tuple[tuple[float, ...], bool]:
     """Return OpenCV's distortion coefficients for a COLMAP camera, and whether it is a fisheye. Raises
     UserError for a camera model that OpenCV can't undistort."""
-    model = camera.model_name
-    coefficients = tuple(camera.params[camera.extra_params_idxs()].tolist())
-    coefficients += (0.0,) * (4 - len(coefficients))
-    if model in PERSPECTIVE_MODELS:
+    coefficients = camera.extra + (0.0,) * (4 - len(camera.extra))
+    if camera.model in PERSPECTIVE_MODELS:
         return coefficients if any(coefficients) else (), False
-    if model in FISHEYE_MODELS:
+    if camera.model in FISHEYE_MODELS:
         return coefficients, True
     raise UserError(
-        f"photo {name} has a {model} camera, which can't be undistorted here: "
+        f"photo {name} has a {camera.model} camera, which can't be undistorted here: "
         "run colmap image_undistorter and use its images and model"
     )
-
-
-# ── binary files ────────────────────────────────────────────────────────────────────────────────────────────
-# pycolmap trusts every length in them, so that a damaged one can make it allocate all memory or read for
-# hours. The layout follows COLMAP's documentation of its output format; numbers are little endian.
-
-_POSE, _KEYPOINT, _OBSERVATION, _SENSOR = 7 * 8, 3 * 8, 2 * 4, 2 * 4
-
-
-def check_binary_model(folder: Path) -> None:
-    """Walk through the records of the binary files present. Raises UserError if a file ends early or
-    continues after its last record."""
-    for name, step in _STEPS.items():
-        path = folder / f"{name}.bin"
-        if not path.is_file():
-            continue
-        with open_file(path) as file:
-            content = file.read()
-        try:
-            count, place = _number("<Q", content, 0), 8
-            for _ in range(count):
-                place = step(content, place)
-                if place > len(content):
-                    break
-        except (struct.error, ValueError, RuntimeError):
-            place = -1
-        if place != len(content):
-            raise UserError(
-                f"the COLMAP model in {folder} is damaged, copy or make it again: the records of "
-                f"{path.name} do not fill its {len(content)} bytes"
-            )
-
-
-@lru_cache
-def _parameters(model: int) -> int:
-    """Return the number of parameters of a camera model."""
-    pycolmap = load_pycolmap()
-    return len(pycolmap.Camera.create_from_model_id(1, pycolmap.CameraModelId(model), 1.0, 2, 2).params)
-
-
-def _camera(content: bytes, place: int) -> int:
-    return place + 24 + 8 * _parameters(_number("<i", content, place + 4))
-
-
-def _image(content: bytes, place: int) -> int:
-    end_of_name = content.index(b"\0", place + 4 + _POSE + 4)
-    return end_of_name + 1 + 8 + _KEYPOINT * _number("<Q", content, end_of_name + 1)
-
-
-def _point(content: bytes, place: int) -> int:
-    tracked = place + 8 + 3 * 8 + 3 + 8
-    return tracked + 8 + _OBSERVATION * _number("<Q", content, tracked)
-
-
-def _rig(content: bytes, place: int) -> int:
-    sensors, place = _number("<I", content, place + 4), place + 8
-    if sensors:
-        place += _SENSOR  # the reference sensor
-    for _ in range(sensors - 1):
-        if place > len(content):
-            break
-        has_pose = _number("<B", content, place + _SENSOR)
-        place += _SENSOR + 1 + _POSE * bool(has_pose)
-    return place
-
-
-def _frame(content: bytes, place: int) -> int:
-    numbers = place + 8 + _POSE
-    return numbers + 4 + (_SENSOR + 8) * _number("<I", content, numbers)
-
-
-def _number(form: str, content: bytes, place: int) -> int:
-    return struct.unpack_from(form, content, place)[0]
-
-
-_STEPS = {"cameras": _camera, "images": _image, "points3D": _point, "rigs": _rig, "frames": _frame}

@@ -23,7 +23,7 @@ from PIL import ExifTags, Image
 from torch import Tensor
 
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.common.pictures import NoPictureError, eight_bits, gray_values, open_picture
+from lang3dxl_ns.common.pictures import NoPictureError, eight_bits, mask_values, open_picture
 from lang3dxl_ns.scene.camera import HasLens, Lens, scaled_size
 
 if TYPE_CHECKING:
@@ -92,7 +92,7 @@ class Photo(HasLens):
         mask = np.ones((self.height, self.width), dtype=bool)
         if self.mask_path is not None:
             with _readable(self.mask_path, self.name), open_picture(self.mask_path) as image:
-                gray = self._drawn_upright(gray_values(image))
+                gray = self._drawn_upright(mask_values(image))
             mask = np.asarray(gray.resize((self.width, self.height), Image.Resampling.NEAREST)) >= 128
         if self.lens.distorts:
             mask = self._undistort(mask * np.uint8(255)) >= 128

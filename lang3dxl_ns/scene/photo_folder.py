@@ -7,9 +7,11 @@ import os
 import re
 import shutil
 import subprocess
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -20,11 +22,15 @@ from scipy import ndimage
 from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import DAMAGE, UserError
 from lang3dxl_ns.common.files import expanded, read_json, write_atomically
-from lang3dxl_ns.common.pictures import NoPictureError, open_picture
+from lang3dxl_ns.common.pictures import (
+    OTHER_SUFFIXES,
+    PHOTO_SUFFIXES,
+    RAW_SUFFIXES,
+    NoPictureError,
+    open_picture,
+    unreadable,
+)
 
-PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp", ".gif", ".avif")
-UNREADABLE_SUFFIXES = (".heic", ".heif", ".dng", ".cr2", ".nef", ".arw")
-"""Suffixes of photos that can't be decoded here."""
 IMAGE_FOLDERS = (Path("images"), Path("dense/images"))
 _NOT_PHOTOS = {
     *("masks", "mask", "segments", "depth", "depths", "normals", "ground_truth", "labels", "sparse", "dense"),
@@ -73,8 +79,8 @@ def readable(photos: PhotoFolder) -> tuple[PhotoFolder, dict[str, str]]:
     good, bad = [], {}
     for name in photos.names:
         path = photos.folder / name
-        if path.suffix.lower() in UNREADABLE_SUFFIXES:
-            bad[name] = f"{path.suffix} can't be read here: convert it to JPEG or PNG"
+        if reason := unreadable(path):
+            bad[name] = reason
             continue
         try:
             with open_picture(path) as image:
@@ -94,10 +100,19 @@ def photos_below(folder: Path) -> list[str]:
             folders[:] = [f for f in folders if f != "numbered"]
         for file in files:
             path = Path(parent, file)
-            known = path.suffix.lower() in (*PHOTO_SUFFIXES, *UNREADABLE_SUFFIXES)
-            if known and not file.startswith(".") and not _OWN.search(file):
+            known = (*PHOTO_SUFFIXES, *RAW_SUFFIXES, *OTHER_SUFFIXES)
+            if path.suffix.lower() in known and not file.startswith(".") and not _OWN.search(file):
                 names.append(path.relative_to(folder).as_posix())
     return sorted(names)
+
+
+def files_below(folder: Path) -> Iterator[str]:
+    """Yield all regular files in a folder and its sub-folders, without hidden ones and the cache."""
+    for parent, folders, files in os.walk(folder):
+        folders[:] = [f for f in folders if f != "lang3dxl_cache" and not f.startswith(".")]
+        for path in (Path(parent, file) for file in files if not file.startswith(".")):
+            if path.is_file():
+                yield path.relative_to(folder).as_posix()
 
 
 def _size_and_lens(path: Path) -> tuple[tuple[int, int], tuple | None]:
@@ -169,7 +184,7 @@ def extract_frames(video: Path, rate: float = FRAMES_PER_SECOND, most: int = MOS
             "ffmpeg), or give a folder of frames"
         )
     duration = _duration(video)
-    stretches = max(1, min(most, int(duration * rate)))
+    stretches = max(1, min(most, int(duration * rate + 0.01)))  # times are rounded
     say(f"{video.name}: {duration:.0f} s, the sharpest frame of each of {stretches} intervals")
     sharpness = _sharpness(video)
     if len(sharpness) < 3:
@@ -200,16 +215,30 @@ def _sharpness(video: Path) -> Float[Array, " n"]:
 
 
 def _duration(video: Path) -> float:
-    asked = ("-select_streams", "v:0", "-show_entries", "stream=codec_type:format=duration", "-of", "json")
+    """Return a video's length in seconds: as it says, or from its frames' times where it does not."""
+    found = _probed(video, "stream=codec_type:format=duration")
+    told = found.get("format", {}).get("duration")
+    if told is not None:
+        return float(told)
+    # Browsers write the length nowhere: they begin a file before they know it.
+    packets = _probed(video, "stream=codec_type:packet=pts_time").get("packets", [])
+    times = sorted(float(packet["pts_time"]) for packet in packets if "pts_time" in packet)
+    if not times:
+        raise UserError(f"{video} does not tell the times of its frames: convert it (ffmpeg -i IN OUT.mp4)")
+    return (times[-1] - times[0]) * len(times) / max(len(times) - 1, 1)
+
+
+def _probed(video: Path, entries: str) -> dict[str, Any]:
+    """Ask ffprobe about a video. Raises UserError for a file without a video that it reads."""
+    asked = ("-select_streams", "v:0", "-show_entries", entries, "-of", "json")
     command = [*_reading("ffprobe", video), *asked]
     found = subprocess.run(command, stdin=_SILENT, capture_output=True, text=True, check=False)
-    try:
+    reason = found.stderr.strip() or "it holds no pictures"
+    with suppress(ValueError, KeyError):
         answer = json.loads(found.stdout)
-        if not answer["streams"]:
-            raise KeyError("streams")
-        return float(answer["format"]["duration"])
-    except (ValueError, KeyError) as error:
-        raise UserError(f"{video} is not a video ffmpeg reads: {found.stderr.strip() or error}") from error
+        if answer["streams"]:
+            return answer
+    raise UserError(f"{video} is not a video that ffmpeg reads: {reason}")
 
 
 def _write(video: Path, folder: Path, chosen: Int[Array, " s"]) -> None:

@@ -13,7 +13,7 @@ import shutil
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
@@ -28,6 +28,7 @@ from lang3dxl_ns.common.memory import machine_memory
 from lang3dxl_ns.common.pictures import open_picture
 from lang3dxl_ns.common.reports import measure, part
 from lang3dxl_ns.scene.colmap import load_pycolmap
+from lang3dxl_ns.scene.learned_features import extract_learned, features_for, match_learned
 from lang3dxl_ns.scene.pairing import pairs_to_match
 from lang3dxl_ns.scene.photo_folder import (
     PhotoFolder,
@@ -46,7 +47,9 @@ if TYPE_CHECKING:
 _MEMORY_PER_THREAD = 1e9  # bytes that SIFT takes on a photo of 1600 pixels, the default `max_size`
 _FEW_FEATURES = 50
 _SMALLEST_MODEL = 3  # photos; COLMAP's default of ten may exceed the number of photos
-_CONVERTED = (".webp", ".gif", ".avif")  # formats that Pillow reads and COLMAP does not
+_ENDINGS = {"JPEG": ".jpg", "MPO": ".jpg", "PNG": ".png", "TIFF": ".tif", "BMP": ".bmp"}
+"""Formats that COLMAP reads; others become JPEGs of this quality."""
+_QUALITY = 98
 _CHUNK_PHOTOS, _CHUNK_PAIRS = 8, 100  # per step of the progress bar; a killed process loses one step
 _STAMP = "photos.json"
 _RELAXED = {"init_min_num_inliers": 30, "init_min_tri_angle": 4.0, "abs_pose_min_num_inliers": 15}
@@ -60,6 +63,7 @@ def reconstruct(
     largest model is written to `model`/0, others to `model`/1 …. Raises UserError that says what to do for
     fewer than two photos, if `model` already exists, and if the photos do not make a scene."""
     settings = settings or ReconstructionSettings()
+    settings = replace(settings, features=features_for(len(photos.names), settings.features))
     if model.exists() and (model_in(model) or any(model.iterdir())):
         raise UserError(f"{model} already exists and is left alone; remove it to reconstruct the photos anew")
     say(f"{len(photos.names)} photos in {photos.folder}, without a COLMAP model: reconstructing")
@@ -70,7 +74,7 @@ def reconstruct(
             database = _database(good, copies, work, settings)
             _extract(database, copies, settings)
         with part("matching"):
-            _match(database, copies.names)
+            _match(database, copies.names, settings)
         with part("mapping"):
             models = _map(database, copies, work, settings.mapper)
     features, partners = _features_and_partners(database)
@@ -102,7 +106,7 @@ def reconstruct_scene(
 ) -> tuple[Path, Path]:
     """Reconstruct a folder of photos or a video, and return the scene's folder and model: sparse/0 in it or,
     if sparse is taken or the folder is read-only, in the cache. Raises UserError as `reconstruct` does."""
-    check_numbers(settings or ReconstructionSettings(), {"max_size": (100, 1e5), "features": (100, 1e6)})
+    check_numbers(settings or ReconstructionSettings(), {"max_size": (100, 1e5), "max_features": (100, 1e6)})
     data = expanded(data).absolute()
     if is_video(data):
         data = extract_frames(data)
@@ -172,12 +176,13 @@ def _numbered(photos: PhotoFolder, work: Path) -> PhotoFolder:
     folder.mkdir(parents=True)
     numbers = []
     for index, name in enumerate(photos.names):
-        source, suffix = photos.folder / name, Path(name).suffix.lower()
+        source = photos.folder / name
         with open_picture(source) as image:  # browsers save WebP under other endings
-            foreign = suffix in _CONVERTED or f".{image.format}".lower() in _CONVERTED
-            number = f"{index:06d}{'.png' if foreign else suffix}"
-            if foreign:
-                image.convert("RGB").save(folder / number)
+            foreign = image.format not in _ENDINGS
+            number = f"{index:06d}{_ENDINGS.get(image.format or '', '.jpg')}"
+            if foreign:  # COLMAP reads the focal length from EXIF
+                exif = image.info.get("exif", b"")
+                image.convert("RGB").save(folder / number, quality=_QUALITY, subsampling=0, exif=exif)
         if not foreign:
             try:
                 (folder / number).symlink_to(source.absolute())
@@ -194,13 +199,14 @@ def _database(photos: PhotoFolder, copies: PhotoFolder, work: Path, settings: Re
     stamp = json.dumps(
         {
             "photos": [[n, s.st_size, s.st_mtime_ns] for n, s in zip(photos.names, states, strict=True)],
-            "settings": [settings.max_size, settings.features, settings.one_camera, copies.names],
+            "settings": [settings.max_size, settings.max_features, settings.one_camera, copies.names],
+            "features": settings.features,
         }
     )
     database, stamped = work / "database.db", work / _STAMP
     if database.is_file() and stamped.is_file() and stamped.read_text() == stamp:
         return database
-    for old in (stamped, *work.glob("database.db*"), *work.glob("importing.db*")):
+    for old in (stamped, *work.glob("database.db*"), *work.glob("importing.db*"), *work.glob("xfeat/*")):
         old.unlink(missing_ok=True)
     importing = work / "importing.db"
     pycolmap.Database.open(importing).close()
@@ -217,7 +223,10 @@ def _database(photos: PhotoFolder, copies: PhotoFolder, work: Path, settings: Re
 
 
 def _extract(database: Path, photos: PhotoFolder, settings: ReconstructionSettings) -> None:
-    """Extract the SIFT features that are missing in the database."""
+    """Extract the features that are missing in the database."""
+    if settings.features == "xfeat":
+        size, count = settings.max_size, settings.max_features
+        return extract_learned(database, photos, database.with_name("xfeat"), size, count)
     pycolmap = load_pycolmap()
     with pycolmap.Database.open(database) as db:
         done = {image.name for image in db.read_all_images() if db.exists_keypoints(image.image_id)}
@@ -225,7 +234,7 @@ def _extract(database: Path, photos: PhotoFolder, settings: ReconstructionSettin
     options = pycolmap.FeatureExtractionOptions(
         max_image_size=settings.max_size,
         num_threads=_threads(_MEMORY_PER_THREAD * (settings.max_size / 1600) ** 2),
-        sift={"max_num_features": settings.features},
+        sift={"max_num_features": settings.max_features},
     )
     with progress("features of photos", len(missing)) as advance:
         for start in range(0, len(missing), _CHUNK_PHOTOS):
@@ -234,8 +243,10 @@ def _extract(database: Path, photos: PhotoFolder, settings: ReconstructionSettin
             advance(len(chunk))
 
 
-def _match(database: Path, names: Sequence[str]) -> None:
+def _match(database: Path, names: Sequence[str], settings: ReconstructionSettings) -> None:
     """Find and verify the matches of pairs that are missing in the database."""
+    if settings.features == "xfeat":
+        return match_learned(database, names, database.with_name("xfeat"))
     pycolmap = load_pycolmap()
     with pycolmap.Database.open(database) as db:
         ids = {image.name: image.image_id for image in db.read_all_images()}

@@ -16,7 +16,11 @@ class ReconstructionSettings:
     """COLMAP's mapper: incremental, or global (GLOMAP), which is meant for many photos."""
     max_size: int = 1600
     """Longer side in pixels at which features are detected; larger photos are shrunk."""
-    features: int = 4096
+    features: Literal["auto", "sift", "xfeat"] = "auto"
+    """Kind of features. xfeat (pip install 'lang3dxl-ns[match]') also matches photos in other light and from
+    other sides; it takes seconds a pair without a GPU. auto: xfeat where it is installed, with a GPU or for
+    at most 100 photos; otherwise sift."""
+    max_features: int = 4096
     """Maximum number of features per photo."""
     one_camera: bool | None = None
     """Whether one camera with one lens took all photos. By default, EXIF and sizes decide."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 import io
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from difflib import get_close_matches
@@ -28,6 +28,12 @@ from lang3dxl_ns.common.files import read_json, write_atomically
 from lang3dxl_ns.common.image import resize_nearest
 from lang3dxl_ns.scene.camera import Camera, Lens, check_pose, view_matrix
 from lang3dxl_ns.scene.companions import is_name
+from lang3dxl_ns.scene.georeference import (
+    Georeference,
+    georeference,
+    georeference_from_json,
+    gps_position,
+)
 from lang3dxl_ns.scene.photo import Photo
 
 SCENE_FILE = "lang3dxl_scene.json"
@@ -133,6 +139,15 @@ class SceneRecord:
     """Matrix [3, 4] that precedes `scale`."""
     data: str
     """Folder of the photos that the run was trained on."""
+    georeference: Georeference | None = None
+    """Meters, up and north, if the photos tell their GPS positions, which are not kept."""
+
+    def located(self, photos: Iterable[Photo]) -> SceneRecord:
+        """Return the record with meters, up and north, if the photos' files tell them."""
+        paths = {photo.name: photo.path for photo in photos}
+        positions = [gps_position(paths[p.name]) if p.name in paths else None for p in self.photos]
+        poses = np.array([photo.camera_to_world for photo in self.photos], dtype=np.float64)
+        return replace(self, georeference=georeference(poses[:, :, 3], poses[:, :, 1].mean(0), positions))
 
     def write(self, path: Path) -> None:
         """Write the file, atomically."""
@@ -171,7 +186,9 @@ def scene_from_json(content: dict[str, Any]) -> SceneRecord:
     """Build the description from a JSON object, after validating all its values. Raises ValueError, KeyError,
     TypeError or AttributeError for anything else."""
     photos = [_photo(**photo) for photo in content["photos"]]
-    scene = SceneRecord(**{**content, "photos": photos})
+    meters = content.get("georeference")
+    meters = None if meters is None else georeference_from_json(meters)
+    scene = SceneRecord(**{**content, "photos": photos, "georeference": meters})
     expect(photos != [], "it lists no photo")
     expect(len({photo.name for photo in photos}) == len(photos), "a photo is listed twice")
     for text in (scene.clip, scene.clip_identity):

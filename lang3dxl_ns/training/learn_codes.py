@@ -1,37 +1,34 @@
-"""Learning codes of finished Gaussians from the photos' targets: gather, sharpen, compress.
-
-A crop yields a single feature for everything in it, so features gathered from crops are blurred at the crop's
-scale; dense features are several times as fine. So Gaussians with similar dense features form a group, and
-each moves part of the way to the mean of its group, where the blur of many places cancels.
-"""
+"""Learning codes of finished Gaussians from the photos' targets: gather, sharpen, compress."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import partial
 
-import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn import Parameter
 
 from lang3dxl_ns.common.console import progress, say, tracked
 from lang3dxl_ns.common.device import in_full_precision
 from lang3dxl_ns.components.feature_decoder import Decoder, Gathered
 from lang3dxl_ns.components.principal_basis import PrincipalBasis
+from lang3dxl_ns.preparation.targets import Batch, foreground
+from lang3dxl_ns.rendering import composite
 from lang3dxl_ns.rendering.gathering import Composite, Pixels, gather
+from lang3dxl_ns.scene.camera import resized
+from lang3dxl_ns.training.sharpening import sharpen
+from lang3dxl_ns.training.state import PhotoCamera, Training
 
 ClipMaps = Callable[[], Iterable[Float[Tensor, "hd wd c"]]]
 DenseMaps = Callable[[], Iterable[Float[Tensor, "t t d"]]]
 DENSE_AXES = 32
 """Number of principal components of the dense features by which groups are formed."""
-_GROUPS = 128
-_SHARE = 0.5
-"""Fraction of the way that a feature moves to its group's mean; the rest keeps individual differences."""
-_SAMPLE = 20_000
-"""Largest number of Gaussians from which groups are formed."""
-_ROWS = 65_536
-"""Number of Gaussians processed at a time, to bound memory."""
+LONGER_SIDE = 1_600
+"""Longer side in pixels to which larger photos are reduced for gathering: a CLIP crop covers hundreds of
+pixels, and time and memory grow with their number."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,6 +45,38 @@ class TargetView:
     """Dense features of the photo squashed to a square."""
     mask: Bool[Tensor, "h w"] | None = None
     """Foreground; None if it is the whole photo."""
+
+
+def learn_words(run: Training, photos: Iterable[tuple[PhotoCamera, Batch]], count: int) -> None:
+    """Give a run's Gaussians codes that represent the targets of this number of photos; see `learn_codes`."""
+    semantics, facts = run.parts.semantics, run.facts
+    assert semantics is not None and facts.clip_targets is not None
+    views, means = (_target_view(run, *photo) for photo in photos), run.gaussians["means"].detach()
+    # Initial codes are fitted to the unsharpened targets, which the loss compares with.
+    dense = None if run.learns_from_renderings else facts.dense_targets
+    codes = learn_codes(semantics.decoder, views, count, means, facts.clip_targets, dense)
+    if run.learns_from_renderings:
+        run.gaussians["codes"].data.copy_(codes.nan_to_num(0.0))
+    else:
+        run.gaussians["codes"] = Parameter(codes.to(run.device), requires_grad=False)
+
+
+def forget_words(run: Training) -> None:
+    """Remove codes that were gathered for a question in training, since the Gaussians still change."""
+    if run.learns_words_at_the_end and "codes" in run.gaussians:
+        del run.gaussians["codes"]
+
+
+def _target_view(run: Training, view: PhotoCamera, batch: Batch) -> TargetView:
+    camera = resized(view.camera(run.pose(view)).detach(), LONGER_SIDE)
+    splats, size = run.splats(), (camera.height, camera.width)
+    return TargetView(
+        partial(composite, splats, camera, backend=run.backend),
+        size,
+        batch["clip_target"],
+        batch.get("dense_target"),
+        foreground(batch),
+    )
 
 
 # A training step's autocast would keep 16-bit copies of the first weights through all steps of the fit.
@@ -102,41 +131,3 @@ def learn_codes(
 
 def _unit(dense: Float[Tensor, "t t d"]) -> Float[Tensor, "t t d"]:
     return F.normalize(dense.float(), dim=-1)
-
-
-def sharpen(
-    features: Float[Tensor, "n c"], dense: Float[Tensor, "n r"], mass: Float[Tensor, " n"]
-) -> Float[Tensor, "n c"]:
-    """Move features half the way to the mean of their group, which keeps the sum of mass · feature. `dense`
-    are gathered dense features, or their coordinates in an orthonormal basis; `mass` the pixels that each
-    Gaussian fills, weighted. One without mass keeps its features, affecting none."""
-    seen = mass > 0
-    if not seen.any():
-        return features
-    share = mass / mass.max()  # sums of masses of any size stay finite
-    group = torch.zeros_like(seen, dtype=torch.long)
-    group[seen] = _groups(dense[seen], share[seen])
-    total = share.new_zeros(_GROUPS).index_add_(0, group, share)
-    weight = (share / total[group].clamp_min(torch.finfo(share.dtype).tiny))[:, None]
-    means = features.new_zeros(_GROUPS, features.shape[1])
-    parts = seen.nonzero()[:, 0].split(_ROWS)
-    for rows in parts:
-        means.index_add_(0, group[rows], weight[rows] * features[rows])
-    sharp = features.clone()
-    for rows in parts:
-        sharp[rows] = sharp[rows].lerp(means[group[rows]], _SHARE)
-    return sharp
-
-
-def _groups(dense: Float[Tensor, "n r"], mass: Float[Tensor, " n"]) -> Int[Tensor, " n"]:
-    """Find each Gaussian's nearest k-means centroid; weights are √mass, so small things have groups too."""
-    from sklearn.cluster import KMeans
-
-    dense = dense - dense.mean(0)  # distances far from 0 would cancel in float32
-    chosen = torch.arange(len(dense))
-    if len(dense) > _SAMPLE:
-        chosen = torch.linspace(0, len(dense) - 1, _SAMPLE, dtype=torch.float64).long()
-    sample, weight = (values[chosen.to(values.device)].cpu().numpy() for values in (dense, mass.sqrt()))
-    found = KMeans(min(_GROUPS, len(sample)), n_init=1, random_state=0).fit(sample, sample_weight=weight)
-    centers = torch.from_numpy(found.cluster_centers_).to(dense)
-    return torch.cat([torch.cdist(rows, centers).argmin(1) for rows in dense.split(_ROWS)])

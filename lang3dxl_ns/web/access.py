@@ -34,13 +34,11 @@ class Access:
     host: str
     port: int
     token: str = field(default_factory=partial(secrets.token_urlsafe, 16))
-    public: bool = False
-    """Whether a tunnel makes a local server public."""
 
     @property
     def needs_token(self) -> bool:
         """Whether clients need the token, since other machines can reach the server."""
-        return self.public or not is_local(self.host)
+        return not is_local(self.host)
 
     @property
     def address(self) -> str:
@@ -56,7 +54,7 @@ class Access:
             host, origin = _only(headers, "Host") or "", _only(headers, "Origin")
             # With a token any name passes.
             ours = self.needs_token or urlsplit(f"//{host}").hostname in (*LOCAL_NAMES, self.host)
-            if not ours or (origin is not None and not self._same_site(origin, host)):
+            if not ours or (origin is not None and not _same_site(origin, host)):
                 return _refused(f"This page is not served to {origin or host}.")
             if not self.needs_token or self._knows_token(headers):
                 return None
@@ -69,17 +67,17 @@ class Access:
         cookie = f"viewer-{self.port}={self.token}; Path=/; HttpOnly; SameSite=Lax"
         return HTTPStatus.SEE_OTHER, {"Set-Cookie": cookie, "Location": "/"}, b""
 
-    def _same_site(self, origin: str, host: str) -> bool:
-        site = urlsplit(origin)
-        own = site.scheme in ("http", "https") and site.netloc.lower() == host.lower()
-        return own or (self.public and (site.hostname or "").endswith(".viser.studio"))
-
     def _knows_token(self, headers: Any) -> bool:
         pairs = (pair.strip() for line in headers.get_all("Cookie") or [] for pair in line.split(";"))
         return any(self._is_token(pair.removeprefix(f"viewer-{self.port}=")) for pair in pairs)
 
     def _is_token(self, offered: str) -> bool:
         return secrets.compare_digest(offered.encode("utf-8", "replace"), self.token.encode())
+
+
+def _same_site(origin: str, host: str) -> bool:
+    site = urlsplit(origin)
+    return site.scheme in ("http", "https") and site.netloc.lower() == host.lower()
 
 
 def _only(headers: Any, name: str) -> str | None:

@@ -19,6 +19,8 @@ export const explain = ({ count, known, live, foreground }) =>
   `${count.toLocaleString("en")} Gaussians. ` + (live ? "Ask for anything." : `Ask for any of ${known.toLocaleString("en")} words.`) +
   (foreground.length ? ` Matches lie on ${foreground.map(([text]) => shown(text)).join(" or ")}.` : "");
 
+export const matched = (count) => `${count.toLocaleString("en")} Gaussians match.`;
+
 function doubtIn({ text, examples, open, taught, trust }) {
   const count = examples && `${examples.length} example${examples.length > 1 ? "s" : ""}`;
   if (examples) return open ? `${count}: click for more, with Alt or “Not this” for what it is not.` : `${count}.`;
@@ -28,29 +30,34 @@ function doubtIn({ text, examples, open, taught, trust }) {
 
 const sentence = (text) => `${text[0].toUpperCase()}${text.slice(1)}.`;
 
-/** Build a prompt's card. acts: { fly, remove, rename, setThreshold, teach, undo, forget }, each called with the prompt. */
-export function promptCard(prompt, { fly, remove, rename, setThreshold, teach, undo, forget }) {
+/** Build a prompt's card. acts: { fly, remove, rename, dragThreshold, setThreshold, teach, outline, save, forget },
+ * each called with the prompt. */
+export function promptCard(prompt, { fly, remove, rename, dragThreshold, setThreshold, teach, outline, save, forget }) {
   const { text, negatives, color, threshold, peak, matching, views, examples, open } = prompt;
   const card = element("li");
   card.style.setProperty("--color", `rgb(${color})`);
   const name = shown(text) + (negatives.length ? ` not ${negatives.map((one) => shown(one)).join(", ")}` : "");
-  const go = element("button", { className: "small fly", disabled: !views?.length, onclick: () => fly(prompt) }, "Fly to");
+  const go = element("button", { className: "small fly", disabled: !views?.some((one) => one.shown), onclick: () => fly(prompt) }, "Fly to");
   const away = element("button", { className: "small", ariaLabel: `Remove ${shown(text)}`, onclick: () => remove(prompt) }, "×");
   const heading = examples ? element("input", { value: text, ariaLabel: "Name", maxLength: 60 }) : element("strong", {}, name);
   heading.addEventListener("change", () => rename(prompt, heading.value));
   const button = (label, act, pressed) => element("button", { className: "small", ariaPressed: pressed, onclick: () => act(prompt) }, label);
   card.append(element("header", {}, heading, ...(examples ? [button(open ? "Done" : "Add", teach, open)] : []), go, away));
   if (open) {
-    const without = button("Not this", () => (without.ariaPressed = prompt.without = !prompt.without), prompt.without);
-    card.append(element("div", { className: "teach" }, without, button("Undo", undo), ...(prompt.named ? [button("Forget", forget)] : [])));
+    const without = button("Not this", () => (without.ariaPressed = prompt.without = !prompt.without), Boolean(prompt.without));
+    without.disabled = !examples.length;
+    card.append(
+      element("div", { className: "teach" }, without, button("Outline", outline), ...(prompt.named ? [button("Save", save), button("Forget", forget)] : [])),
+      element("p", { className: "hint" }, examples.length ? prompt.told ?? "" : "Click on it in the view, or outline it. Then give it a name.")); // prettier-ignore
   }
   if (threshold == null) return card;
   const slider = element("input", { type: "range", min: 0, max: 1, step: 0.01, value: threshold, ariaLabel: `Threshold of ${shown(text)}` });
+  slider.addEventListener("input", () => dragThreshold(prompt, Number(slider.value)));
   slider.addEventListener("change", () => setThreshold(prompt, Number(slider.value)));
   const ends = [threshold, peak].map((value) => element("span", {}, value.toFixed(2)));
   if (peak > threshold) card.append(element("div", { className: "ends" }, ends[0], element("div", { className: "heat" }), ends[1]));
   card.append(
-    element("p", {}, `${doubtIn(prompt)} ${matching.toLocaleString("en")} Gaussians match.`),
+    element("p", {}, `${doubtIn(prompt)} `, element("span", { className: "count" }, matched(matching))),
     element("label", {}, "Threshold", slider)); // prettier-ignore
   return card;
 }

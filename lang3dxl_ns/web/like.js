@@ -2,11 +2,31 @@
 
 const RIDGE = 0.01, STEPS = 8, OTHERS = 2000; // penalty, Newton steps, Gaussians that represent the scene
 
-/** Compute every Gaussian's probability of being like the examples: [{ rows, without }], Gaussians that were clicked.
- *
- * This is a weighted logistic regression on the decoder's rows, standardized over the scene. Together the examples
- * weigh as much as what they compete with: the scene, and Gaussians clicked `without`. */
+/** Compute every Gaussian's probability of being like the examples: [{ rows, without }], Gaussians that were marked.
+ * A counterexample only ever lowers it: the least of all fits without the latest counterexamples counts. */
 export function likeness(rows, examples) {
+  const wanted = examples.filter((one) => !one.without), unwanted = examples.filter((one) => one.without);
+  return unwanted.reduce((least, _, k) => {
+    const fit = remembered(rows, [...wanted, ...unwanted.slice(0, k + 1)]);
+    return least.map((value, i) => Math.min(value, fit[i]));
+  }, remembered(rows, wanted));
+}
+
+const fits = new Map(); // of the examples that were asked latest
+const MOST_FITS = 12;
+
+function remembered(rows, examples) {
+  const key = JSON.stringify(examples.map(({ rows, without }) => [rows, without]));
+  const fit = fits.get(key) ?? likely(rows, examples);
+  fits.delete(key);
+  fits.set(key, fit);
+  if (fits.size > MOST_FITS) fits.delete(fits.keys().next().value);
+  return fit;
+}
+
+/** Fit a weighted logistic regression on the decoder's rows, standardized over the scene. Together the examples weigh
+ * as much as what they compete with: the scene, and Gaussians marked `without`. */
+function likely(rows, examples) {
   const { width, count } = rows, known = [];
   for (let i = 0, step = Math.max(Math.floor(count / OTHERS), 1); i < count; i += step) if (rows.scales[i]) known.push(i);
   const wanted = examples.filter((one) => !one.without), unwanted = examples.filter((one) => one.without);

@@ -19,7 +19,7 @@ from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.components.feature_decoder import Decoder
 from lang3dxl_ns.components.hash_grid import HASH_PRIMES
 from lang3dxl_ns.components.semantic_field import SemanticField
-from lang3dxl_ns.files.splat_file import array_of
+from lang3dxl_ns.files.activations import array_of
 from lang3dxl_ns.query.engine import PerGaussian
 from lang3dxl_ns.query.visibility import VisibleGaussians
 from lang3dxl_ns.rendering import Splats

@@ -1,33 +1,22 @@
-// The page: the search box and its prompts, answers to clicks, the address, and the keys.
-import { element, explain, percent, promptCard, say, shown } from "./cards.js";
+// The page: the search box and its prompts, answers to clicks, words that are taught, and the keys.
+import { element, explain, matched, percent, promptCard, say, shown } from "./cards.js";
+import { Kept, readFields, Steps, written } from "./history.js";
+import { Photos } from "./photos.js";
+import { areExamples, asPython, drawOutline, examplesAsText, examplesFromText, inside, rounded, UNNAMED, wordsFile } from "./teach.js";
+import { thinker } from "./think.js";
 import { parsePrompts, tidy } from "./vocabulary.js";
 import { View } from "./view.js";
 
-const MOST_KEPT = 20, TYPING = 500; // most earlier prompts or named words; milliseconds until negatives take effect
-const UNNAMED = /^like this (\d+)$/;
+const TYPING = 500, MOST_TRIED = 6, TIE = 0.02; // milliseconds until negatives take effect; suggested words; relevancies that tell words apart
 const $ = (id) => document.getElementById(id);
-const prompts = [];
-let about, view, latest = null, read = "", settled = false, cleared = 0; // settled: the address has been read; cleared: how often all prompts were removed
+const prompts = [], taughtHere = new Set(); // names that were taught to the server's scene from here
+let about, view, photos, steps, kept, latest = null, settled = false, cleared = 0; // settled: the address has been read; cleared: how often all prompts were removed
+let outlining = null, chosenLook = "";
 
-// ── the worker ──
-
-const worker = new Worker("worker.js", { type: "module" }), waiting = new Map();
-worker.onmessage = ({ data: { id, output, error, done } }) => {
-  if (done !== undefined) return say(`Reading what the scene means: ${percent(done)}`);
-  const [resolve, reject] = waiting.get(id);
-  waiting.delete(id);
-  if (error) reject(new Error(error));
-  else resolve(output);
-};
-worker.onerror = () => say("This browser can't run the page's worker: update it.");
-
-function think(job, input = {}) {
-  return new Promise((...settle) => {
-    const id = Math.random();
-    waiting.set(id, settle);
-    worker.postMessage({ id, job, input });
-  });
-}
+const think = thinker(
+  (done) => say(`Reading what the scene means: ${percent(done)}`),
+  () => say("This browser can't run the page's worker: update it."),
+);
 
 // ── asking ──
 
@@ -35,8 +24,10 @@ const commonNegatives = () => $("not").value.split(/[,;]/).map(tidy).filter(Bool
 
 /** Answer a prompt anew, with the common negatives. */
 async function answer(prompt) {
-  const { text, examples, chosen: threshold } = prompt, negatives = [...prompt.negatives, ...commonNegatives()];
+  const { text, chosen: threshold } = prompt, negatives = [...prompt.negatives, ...commonNegatives()];
+  const examples = prompt.inScene ? null : prompt.examples;
   const turn = (prompt.turn = {}); // a later answer to the same prompt wins
+  if (prompt.examples && !prompt.examples.length) return Object.assign(prompt, { known: true, relevancy: null, threshold: null });
   const found = await think("ask", { text, examples, negatives, threshold });
   if (turn !== prompt.turn || !found.known) return found;
   return Object.assign(prompt, found, { views: null, box: null, finding: null });
@@ -54,27 +45,31 @@ async function answerAll() {
 
 /** Find the views that show prompts best, once their heat is drawn. */
 function findPlaces() {
-  for (const prompt of prompts.filter((one) => one.relevancy && !one.finding)) {
+  for (const prompt of prompts.filter((one) => one.relevancy && !one.finding && !one.dragged)) {
     const { relevancy, threshold, turn } = prompt;
     prompt.finding = think("find", { relevancy, threshold }).then((places) => {
       if (turn !== prompt.turn) return;
       Object.assign(prompt, places);
-      prompt.card.querySelector(".fly").disabled = !places.views.length;
+      prompt.card.querySelector(".fly").disabled = !places.views.some((one) => one.shown);
       drawBoxes();
     });
   }
 }
 
-/** Remove all prompts, and drop the answers that are still awaited. */
+/** Drop the answers that are still awaited; returns the turn of those that come next. */
+const drop = () => ++cleared;
+
+/** Remove all prompts. */
 function clear() {
+  drop();
   prompts.length = 0;
-  return ++cleared;
+  settle();
 }
 
-/** Ask prompts as if typed, separated by `;`. Resolves to the answer to the last one. turn: what `clear` returned last. */
+/** Ask prompts as if typed, separated by `;`. Resolves to the answer to the last one. turn: what `drop` returned last. */
 async function ask(typed, turn = cleared) {
   await reading;
-  $("near").replaceChildren();
+  quiet();
   let found = null;
   for (const { text, negatives } of about.words ? parsePrompts(String(typed)) : []) {
     const word = namedWord(text) ?? { text };
@@ -87,12 +82,16 @@ async function ask(typed, turn = cleared) {
       continue;
     }
     const card = old ?? same() ?? prompt; // the same prompt may have been answered in the meantime
-    if (!card.color) prompts.push(Object.assign(card, { color: unusedColor() }));
-    remember(text);
+    if (!card.color) add(card);
+    kept.store("prompts", [text, ...kept.list("prompts").filter((other) => other !== text)]);
     draw(settled ? card : null);
   }
   const { known = false, doubtful = true, threshold = null, peak = 0, matching = 0 } = found ?? {};
   return { known, doubtful, threshold, peak, matching };
+}
+
+function add(prompt) {
+  prompts.push(Object.assign(prompt, { color: unusedColor() }));
 }
 
 /** Offer the words closest to an unknown one; a click puts a word in its place, in the prompt and in "But not". */
@@ -103,12 +102,19 @@ function offerClosest({ unknown, closest }, { text, negatives }) {
     if (common.includes(unknown)) await answerAll();
     return ask(asTyped({ text: mended(text), negatives: negatives.map(mended) }));
   }
-  const words = closest.map((word) => element("button", { className: "small", onclick: () => attempt(() => mend(word)) }, word));
+  const words = closest.map((word) => choice(word, () => mend(word)));
   $("near").replaceChildren(`This page doesn't know “${shown(unknown)}”: it answers ${about.known.toLocaleString("en")} words by itself. `,
     words.length ? "Closest: " : "", ...words); // prettier-ignore
 }
 
+const choice = (label, act) => element("button", { className: "small", onclick: () => attempt(act) }, label);
 const unusedColor = () => about.colors.find((color) => prompts.every((prompt) => prompt.color !== color)) ?? about.colors[prompts.length % about.colors.length];
+
+/** Take away messages about what was done before. */
+function quiet() {
+  $("near").replaceChildren();
+  say(explain(about));
+}
 
 /** Run work that may fail, and show the reason if it does. */
 async function attempt(work) {
@@ -123,23 +129,26 @@ async function attempt(work) {
 
 /** Show all prompts, and scroll to `newest`, for small panels. */
 function draw(newest = null) {
-  const acts = { fly, remove, rename, setThreshold, teach, undo, forget };
+  const acts = { fly, remove, rename, dragThreshold, setThreshold, teach, outline, save, forget }, focused = document.activeElement;
+  const [from, label] = [prompts.find(({ card }) => card?.contains(focused)), focused?.ariaLabel ?? focused?.textContent];
   for (const prompt of prompts) prompt.card = promptCard(prompt, acts);
   $("prompts").replaceChildren(...prompts.map(({ card }) => card));
+  [...(from?.card.querySelectorAll("button, input") ?? [])].find((one) => (one.ariaLabel ?? one.textContent) === label)?.focus();
+  $("try").hidden = prompts.length > 0;
   view.recolor(prompts.filter((prompt) => prompt.relevancy));
   newest?.card.scrollIntoView({ block: "nearest" });
   drawBoxes();
-  writeAddress();
+  keepAddress();
 }
 
 function drawBoxes() {
   const boxes = $("boxed").checked ? prompts.filter((prompt) => prompt.box) : [];
-  $("boxes").replaceChildren(...boxes.flatMap(outline));
+  $("boxes").replaceChildren(...boxes.flatMap(outlineBox));
 }
 
 const CORNERS = [0, 1, 2, 3, 4, 5, 6, 7], NAMESPACE = "http://www.w3.org/2000/svg";
 
-function outline({ box: { low, high }, color, text }) {
+function outlineBox({ box: { low, high }, color, text }) {
   const corners = CORNERS.map((k) => view.pixel(low.map((value, axis) => ((k >> axis) & 1 ? high[axis] : value))));
   if (!corners.every(Boolean)) return [];
   const edges = CORNERS.flatMap((k) => [1, 2, 4].filter((step) => !(k & step)).map((step) => `M${corners[k]}L${corners[k + step]}`));
@@ -153,16 +162,19 @@ function outline({ box: { low, high }, color, text }) {
 }
 
 function fly(prompt) {
-  const shows = prompt.views.filter((one) => one.shown), views = shows.length ? shows : prompt.views.slice(0, 1);
+  const views = prompt.views.filter((one) => one.shown);
   if (!views.length) return;
   prompt.place = ((prompt.place ?? -1) + 1) % views.length;
   const best = views[prompt.place], middle = prompt.box?.low.map((value, axis) => (value + prompt.box.high[axis]) / 2);
-  view.flyTo(about.views[best.index], middle);
+  photos.hide();
+  view.mover.walk(false);
+  view.mover.flyTo(about.views[best.index], middle);
   say(`View ${prompt.place + 1} of ${views.length}: ${best.name}; ${percent(best.area)} of it matches.`);
 }
 
 function remove(prompt) {
   prompts.splice(prompts.indexOf(prompt), 1);
+  quiet();
   draw();
 }
 
@@ -172,11 +184,23 @@ function rename(prompt, name) {
   prompt.named = true;
   keepWord(prompt, before);
   draw();
+  attempt(() => teachScene(prompt, before));
 }
 
-async function setThreshold(prompt, value) {
-  prompt.chosen = value;
-  await attempt(() => answer(prompt));
+/** Follow a threshold that is being dragged: its heat and count, nothing else. */
+function dragThreshold(prompt, value) {
+  let count = 0;
+  for (const relevancy of prompt.relevancy) count += relevancy > value;
+  Object.assign(prompt, { chosen: value, threshold: value, matching: count, dragged: true });
+  prompt.card.querySelector(".count").textContent = matched(count);
+  const end = prompt.card.querySelector(".ends span");
+  if (end) end.textContent = value.toFixed(2);
+  view.recolor(prompts.filter((one) => one.relevancy));
+}
+
+function setThreshold(prompt, value) {
+  dragThreshold(prompt, value);
+  Object.assign(prompt, { dragged: false, finding: null, views: null, box: null, turn: {} });
   draw();
 }
 
@@ -191,198 +215,325 @@ async function whatIs(x, y, most = 5) {
 
 async function tell({ x, y, without }) {
   if (!about.words) return;
-  const words = await whatIs(x, y), teaching = prompts.find((prompt) => prompt.examples && prompt.open), { rows } = latest;
-  if (teaching && rows.length) return addExample(teaching, without || teaching.without);
-  const buttons = words.map(([word, score]) =>
-    element("button", { className: "small", onclick: () => attempt(() => ask(word)) }, `${word} ${percent(score)}`));
-  const like = element("button", { className: "small", onclick: likeThis }, "Like this");
-  $("here").replaceChildren(element("p", {}, words.length ? "Here, words that fit best:" : `Nothing is there${rows.length ? " that has a name" : ""}.`),
-    element("div", {}, ...buttons, ...(rows.length ? [like] : []))); // prettier-ignore
+  const teaching = prompts.find((prompt) => prompt.examples && prompt.open);
+  if (teaching) return addMark(teaching, [[x, y]], without || teaching.without);
+  const words = await whatIs(x, y), { rows } = latest, best = words[0]?.[1] ?? 0;
+  const tied = words.filter(([, score]) => score > best - TIE), several = tied.length > 2;
+  const buttons = (several ? tied : words).map(([word, score]) => choice(several ? word : `${word} ${percent(score)}`, () => ask(word)));
+  quiet();
+  const told = several ? "Here several words fit equally well, so none is sure:" : "Here, words that fit best:";
+  $("here").replaceChildren(element("p", {}, words.length ? told : `Nothing is there${rows.length ? " that has a name" : ""}.`),
+    element("div", {}, ...buttons, ...(rows.length ? [choice("Like this", () => likeThis([[x, y]]))] : []))); // prettier-ignore
   $("here").hidden = false;
 }
 
-/** Highlight what looks like the place clicked last; further clicks add examples. */
-function likeThis() {
-  const number = 1 + Math.max(0, ...prompts.map((prompt) => Number(UNNAMED.exec(prompt.text)?.[1] ?? 0)));
-  const prompt = { text: `like this ${number}`, negatives: [], examples: [], color: unusedColor() };
-  prompts.push(prompt);
-  teach(prompt, true);
-  attempt(() => addExample(prompt, false));
+/** Turn around what is at a pixel, from now on. */
+async function focusOn({ x, y }) {
+  $("here").hidden = true;
+  const point = about.words ? await think("point", { camera: view.picking, x, y }) : null;
+  if (point) view.mover.focus(point);
 }
 
-/** Set whether clicks add examples to this prompt. */
+const middle = () => ({ x: view.frame.clientWidth / 2, y: view.frame.clientHeight / 2 });
+
+// ── teaching ──
+
+/** Start a word to be taught: further clicks and outlines mark it. */
+function startWord() {
+  const number = 1 + Math.max(0, ...prompts.map((prompt) => Number(UNNAMED.exec(prompt.text)?.[1] ?? 0)));
+  const prompt = { text: `like this ${number}`, negatives: [], examples: [] };
+  add(prompt);
+  teach(prompt, true);
+  return prompt;
+}
+
+/** Highlight what looks like the place clicked last; further clicks add examples. */
+const likeThis = (pixels) => addMark(startWord(), pixels, false);
+
+/** Set whether clicks add examples to this prompt. A word without any mark is given up. */
 function teach(prompt, open = !prompt.open) {
   for (const other of prompts) other.open = other === prompt && open;
+  if (!open && !prompt.examples.length) prompts.splice(prompts.indexOf(prompt), 1);
   $("here").hidden = true;
-  draw();
+  quiet();
+  draw(prompts.includes(prompt) ? prompt : null);
 }
 
-async function addExample(prompt, without) {
-  prompt.examples.push({ rows: latest.rows, without: Boolean(without) });
+/** Mark pixels of the view, or an outline around them, as the word or as something else. */
+async function addMark(prompt, pixels, without, outline = null) {
+  const prefer = prompt.examples.flatMap(({ photo }) => (photo === undefined ? [] : [about.cameras[photo].name]));
+  const there = photos.shown && (outline ?? pixels).map((pixel) => photos.within(pixel)), inPhoto = there && there.every(Boolean);
+  const { rows, photo, points } = await think("mark", { camera: view.picking, pixels, prefer });
+  if (!rows.length) return say("Nothing with a meaning is there: mark another place.");
+  const index = about.cameras.findIndex(({ name }) => name === (inPhoto ? photos.shown.name : photo));
+  const place = index < 0 ? {} : inPhoto ? { photo: index, [outline ? "outline" : "points"]: rounded(there) } : { photo: index, points: rounded(points) };
+  prompt.examples.push({ rows, without: Boolean(without && prompt.examples.length), ...place });
+  prompt.inScene = false;
   await answer(prompt);
   keepWord(prompt);
+  quiet();
   draw(prompt);
+  await teachScene(prompt);
 }
 
-/** Remove the latest example. */
-async function undo(prompt) {
-  if (prompt.examples.length === 1) return remove(prompt);
-  prompt.examples.pop();
+/** Let the user outline the word in the view or in the photo that is shown. */
+async function outline(prompt) {
+  outlining = new AbortController();
+  say("Draw around it, without lifting the finger or the button. Escape gives up.");
+  const found = await drawOutline($("stage"), outlining.signal);
+  outlining = null;
+  quiet();
+  if (found) await attempt(() => addMark(prompt, inside(found), prompt.without, found));
+}
+
+/** Teach a named word to the scene behind a live page, which answers it from then on. */
+async function teachScene(prompt, before = prompt.text) {
+  const marks = about.live && prompt.named ? asPython(prompt.examples, about.cameras) : [];
+  if (!marks.length) {
+    if (prompt.named && !about.live) tellCard(prompt, "This browser keeps it. Save writes a file for lang3dxl words --load, which learns it from the photos.");
+    return;
+  }
+  const answered = await fetch("api/teach", { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify({ name: prompt.text, before, examples: marks }) });
+  if (!answered.ok) return tellCard(prompt, `The scene did not learn it: ${await answered.text()}`);
+  taughtHere.add(prompt.text);
+  await think("forget", { texts: [prompt.text, before] });
+  prompt.inScene = true;
   await answer(prompt);
-  keepWord(prompt);
+  prompt.told = (await answered.json()).told;
   draw();
 }
 
-function forget(prompt) {
-  store("words", stored("words").filter(({ name }) => name !== prompt.text));
+function tellCard(prompt, told) {
+  prompt.told = told;
+  draw();
+}
+
+function save(prompt) {
+  download("words.json", new Blob([wordsFile([prompt], about)], { type: "application/json" }));
+  say("Teach it to the scene: lang3dxl words SCENE --load words.json");
+}
+
+async function forget(prompt) {
+  kept.store("words", kept.list("words").filter(({ name }) => name !== prompt.text));
   remove(prompt);
+  if (!taughtHere.delete(prompt.text)) return;
+  await fetch("api/teach", { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify({ name: prompt.text, before: prompt.text, examples: [] }) });
+  await think("forget", { texts: [prompt.text] });
 }
 
 /** Keep a named word in this browser; it replaces those with its present and former name. */
 function keepWord({ text, examples, named }, before = text) {
-  const others = stored("words").filter(({ name }) => ![text, before].includes(name));
-  if (named) store("words", [{ name: text, examples }, ...others]);
+  const others = kept.list("words").filter(({ name }) => ![text, before].includes(name));
+  if (named) kept.store("words", [{ name: text, examples }, ...others]);
 }
 
 /** Return a word that was named in this browser as a prompt; null if there is none. */
 function namedWord(text) {
-  const found = stored("words").find(({ name }) => name?.toLowerCase() === text.toLowerCase());
-  return found && areExamples(found.examples) ? { text: found.name, examples: found.examples, named: true } : null;
+  const found = kept.list("words").find(({ name }) => name?.toLowerCase() === text.toLowerCase());
+  return found && areExamples(found.examples, about.count) ? { text: found.name, examples: found.examples, named: true } : null;
 }
 
-/** Return whether these are examples in this scene, and the first one shows what is meant. */
-function areExamples(examples) {
-  const known = (row) => Number.isInteger(row) && row >= 0 && row < about.count;
-  return Array.isArray(examples) && examples.length > 0 && !examples[0].without && examples.every(({ rows }) => rows?.length && rows.every(known));
-}
-
-// ── address, history ──
+// ── address ──
 
 const asTyped = ({ text, negatives }) => `"${text}"` + (negatives.length ? ` not ${negatives.map((one) => `"${one}"`).join(", ")}` : "");
-const asExamples = (prompt) => [prompt.text, ...prompt.examples.map(({ rows, without }) => (without ? "-" : "") + rows.join("."))].join("~");
 
-function writeAddress() {
-  if (!settled) return;
-  const fields = new URLSearchParams({ view: view.address });
-  prompts.forEach((prompt) => fields.append(prompt.examples ? "like" : "ask", prompt.examples ? asExamples(prompt) : asTyped(prompt)));
-  if ($("not").value) fields.set("not", $("not").value);
-  read = `#${fields}`;
-  history.replaceState(null, "", read);
+function asField(prompt) {
+  const { examples, color, chosen } = prompt;
+  return { kind: examples ? "like" : "ask", text: examples ? examplesAsText(prompt.text, examples) : asTyped(prompt), at: chosen, hue: about.colors.indexOf(color) };
 }
 
-async function readAddress(turn = clear()) {
-  const fields = new URLSearchParams(location.hash.slice(1));
-  if (fields.has("view")) view.address = fields.get("view");
-  $("not").value = fields.get("not") ?? "";
+/** What is shown, as an address. */
+const shownNow = () =>
+  written({
+    view: view.mover.address, walk: view.mover.walking ? 1 : "", not: $("not").value, hide: Number($("hide").value) || "", look: chosenLook,
+    boxes: $("boxed").checked ? 1 : "", cameras: $("cameras").ariaPressed === "true" ? 1 : "", photo: photos.shown?.name,
+    prompts: prompts.filter(({ examples }) => !examples || examples.length).map(asField),
+  }); // prettier-ignore
+
+/** Keep what is shown in the address. own: whether Back returns to here even if only the view changes. */
+function keepAddress(own = false) {
+  if (settled) steps.keep(shownNow(), own);
+}
+
+/** Show what an address says. Prompts that are shown already stay as they are. */
+async function apply(hash, turn = drop()) {
+  const wanted = readFields(hash), found = [], open = prompts.find((prompt) => prompt.open)?.text;
   settled = false;
-  const likes = about.words ? fields.getAll("like") : [];
+  outlining?.abort();
+  photos.hide();
+  if (wanted.view) view.mover.address = wanted.view;
+  view.mover.walk(wanted.walk === "1");
+  $("boxed").checked = wanted.boxes === "1";
+  $("cameras").ariaPressed = String(wanted.cameras === "1");
+  $("hide").value = Number(wanted.hide) || 0;
+  hideFloaters();
+  attempt(() => chooseLook(wanted.look ?? ""));
+  const common = $("not").value !== (wanted.not ?? "");
+  $("not").value = wanted.not ?? "";
   try {
-    for (const typed of fields.getAll("ask").slice(0, 20)) if (turn === cleared) await ask(typed, turn);
-    for (const like of likes.slice(0, 20)) if (turn === cleared) await readExamples(like);
+    for (const one of about.words ? wanted.prompts : []) {
+      for (const specified of specify(one)) {
+        const old = common ? null : prompts.find((prompt) => String(Object.values(asField(prompt)).slice(0, 3)) === String(Object.values(asField({ ...specified, color: null })).slice(0, 3)));
+        const prompt = old ?? specified, answered = old ?? (await answer(prompt));
+        if (turn !== cleared) return;
+        if (!answered.known) offerClosest(answered, prompt);
+        else if (!found.includes(prompt)) found.push(Object.assign(prompt, { color: about.colors[one.hue % about.colors.length], open: prompt.text === open }));
+      }
+    }
+    prompts.splice(0, prompts.length, ...found);
+    for (const prompt of found) if (prompt.named) keepWord(prompt);
+    for (const prompt of found) if (taughtHere.has(prompt.text) && !prompt.inScene) attempt(() => teachScene(prompt));
+    if (wanted.photo && photos.named(wanted.photo)?.photo) photos.show(photos.named(wanted.photo));
   } finally {
-    if (turn === cleared) settle();
+    if (turn === cleared) settle(hash);
   }
 }
 
-function settle() {
+/** Read a prompt of an address: { kind, text, at } as prompts without answers. */
+function specify({ kind, text, at }) {
+  if (kind === "ask") return parsePrompts(text).map((prompt) => ({ ...prompt, ...(at !== undefined && { chosen: at }) }));
+  const read = examplesFromText(text, about);
+  if (!read || !tidy(read.name)) return [];
+  return [{ text: tidy(read.name), negatives: [], examples: read.examples, named: !UNNAMED.test(read.name), ...(at !== undefined && { chosen: at }) }];
+}
+
+/** End the reading of an address: what is shown is what it says now. */
+function settle(hash = null) {
   settled = true;
+  if (hash !== null) steps.begin(shownNow());
   draw();
 }
-
-async function readExamples(like) {
-  const [text, ...examples] = like.split("~");
-  const parsed = examples.map((one) => ({ rows: one.replace("-", "").split(".").map(Number), without: one.startsWith("-") }));
-  if (!areExamples(parsed)) return;
-  const prompt = { text: tidy(text), negatives: [], examples: parsed, color: unusedColor(), named: !UNNAMED.test(text) };
-  prompts.push(prompt);
-  await answer(prompt);
-}
-
-/** Key of a list kept in this browser for the scene: earlier "prompts" or named "words", latest first. */
-const memory = (kind) => `lang3dxl ${kind} ${about.title} ${about.count} ${about.center}`;
-
-function stored(kind) {
-  try {
-    return [JSON.parse(localStorage.getItem(memory(kind)))].flat().filter(Boolean);
-  } catch {
-    return []; // the browser keeps nothing
-  }
-}
-
-function store(kind, list) {
-  try {
-    localStorage.setItem(memory(kind), JSON.stringify(list.slice(0, MOST_KEPT)));
-  } catch {} // the browser keeps nothing
-}
-
-const remember = (text) => store("prompts", [text, ...stored("prompts").filter((other) => other !== text)]);
 
 // ── controls ──
 
 async function offer() {
   const typed = $("word").value.split(";").at(-1), before = $("word").value.slice(0, $("word").value.length - typed.length);
-  const own = stored("words").map(({ name }) => String(name)), start = tidy(typed).toLowerCase();
-  const words = start ? [...own.filter((name) => name.toLowerCase().includes(start)), ...(await think("offered", { typed }))] : [...own, ...stored("prompts").map(String)];
+  const own = kept.list("words").map(({ name }) => String(name)), start = tidy(typed).toLowerCase(), offered = await think("offered", { typed });
+  const words = start ? [...own.filter((name) => name.toLowerCase().includes(start)), ...offered] : [...own, ...kept.list("prompts").map(String), ...offered];
   $("offered").replaceChildren(...[...new Set(words)].map((word) => element("option", { value: before + word })));
+}
+
+/** Suggest words to a visitor who has asked nothing yet. */
+async function suggest() {
+  const words = [...new Set([...kept.list("words").map(({ name }) => String(name)), ...(about.suggested ?? (await think("offered", { typed: "" })))])];
+  $("try").replaceChildren("Try: ", ...words.slice(0, MOST_TRIED).map((word) => choice(word, () => ask(word))));
+}
+
+function on(id, kind, act) {
+  $(id).addEventListener(kind, (event) => attempt(() => act(event)));
 }
 
 function listen() {
   let typing, moving;
-  $("ask").addEventListener("submit", (event) => {
+  on("ask", "submit", (event) => {
     event.preventDefault();
     const typed = $("word").value;
     $("word").value = "";
-    if (tidy(typed)) attempt(() => ask(typed));
+    return tidy(typed) ? ask(typed) : null;
   });
   for (const kind of ["input", "focus"]) $("word").addEventListener(kind, () => reading.then(offer));
   $("not").addEventListener("input", () => {
     clearTimeout(typing);
     typing = setTimeout(() => attempt(answerAll), TYPING);
   });
-  $("boxed").addEventListener("change", drawBoxes);
-  $("overview").addEventListener("click", () => view.overview());
-  $("still").addEventListener("click", () => attempt(saveStill));
-  $("link").addEventListener("click", () => attempt(copyLink));
-  $("look").addEventListener("change", () => attempt(light));
+  on("boxed", "change", () => (drawBoxes(), keepAddress()));
+  on("clear", "click", clear);
+  on("overview", "click", () => (photos.hide(), quiet(), view.mover.overview()));
+  on("teach", "click", () => startWord().card.querySelector("input").focus());
+  on("still", "click", saveStill);
+  on("link", "click", copyLink);
+  on("look", "change", () => chooseLook($("look").value).then(() => keepAddress()));
+  on("hide", "input", hideFloaters);
+  on("hide", "change", () => keepAddress());
+  on("undo", "click", () => steps.undo());
+  on("redo", "click", () => steps.redo());
+  on("walk", "click", () => (view.mover.walk(), $("frame").focus()));
+  on("cameras", "click", ({ currentTarget }) => {
+    $("cameras").ariaPressed = String($("cameras").ariaPressed !== "true");
+    photos.draw();
+    keepAddress();
+  });
+  on("free", "change", () => (view.mover.free = $("free").checked));
+  on("fold", "click", () => ($("fold").ariaExpanded = String(!document.body.classList.toggle("folded"))));
+  on("full", "click", () => (document.fullscreenElement ? document.exitFullscreen() : document.documentElement.requestFullscreen()));
+  $("full").hidden = !document.fullscreenEnabled;
+  document.addEventListener("fullscreenchange", () => ($("full").ariaPressed = String(Boolean(document.fullscreenElement))));
   view.addEventListener("click", ({ detail }) => attempt(() => tell(detail)));
+  view.addEventListener("double", ({ detail }) => attempt(() => focusOn(detail)));
   view.addEventListener("drawn", findPlaces);
   view.addEventListener("moved", () => {
     drawBoxes();
     clearTimeout(moving);
-    moving = setTimeout(writeAddress, 300);
+    moving = setTimeout(keepAddress, 300);
   });
-  addEventListener("keydown", (event) => {
-    if (event.target.matches("input, select")) return; // Escape empties a search box, or closes its list
-    if (event.key === "/") {
-      event.preventDefault();
-      $("word").focus();
-    }
-    if (event.key === "Escape") {
-      clear();
-      $("here").hidden = true;
-      settle();
-    }
-  });
+  view.mover.addEventListener("far", () => keepAddress(true));
+  view.mover.addEventListener("walks", () => ($("walk").ariaPressed = String(view.mover.walking)));
+  view.mover.addEventListener("blocked", () => say("The photos show nothing of what is there: hold Shift, or choose “Go anywhere” under More, to go on."));
+  addEventListener("keydown", (event) => press(event));
 }
 
-async function saveStill() {
-  const lines = prompts.map((prompt) => [shown(prompt.text), `rgb(${prompt.color})`]);
-  const link = element("a", { download: "scene.png", href: URL.createObjectURL(await view.picture(lines)) });
+/** Answer a key that means the same everywhere on the page. */
+function press(event) {
+  const typing = event.target.matches("input:not([type=range], [type=checkbox]), select"), { key } = event, command = event.ctrlKey || event.metaKey;
+  if (key === "Escape") {
+    if (typing) event.preventDefault(); // or it would empty the search box
+    return typing ? event.target.blur() : close();
+  }
+  if (typing || event.altKey) return;
+  const again = key.toLowerCase() === "y" || event.shiftKey, onPicture = event.target === $("frame") || event.target === document.body;
+  const act = command
+    ? { z: () => (again ? steps.redo() : steps.undo()), y: () => steps.redo() }[key.toLowerCase()]
+    : { "/": () => $("word").focus(), ",": () => photos.step(-1), ".": () => photos.step(1), ...(onPicture && { Enter: () => tell(middle()), f: () => focusOn(middle()) }) }[key];
+  if (!act) return;
+  event.preventDefault();
+  attempt(async () => act());
+}
+
+/** Close what is open, the latest first; nothing is lost. */
+function close() {
+  const open = prompts.find((prompt) => prompt.open);
+  if (outlining) outlining.abort();
+  else if (photos.shown || photos.coming) photos.hide();
+  else if (!$("here").hidden) $("here").hidden = true;
+  else if (open) teach(open, false);
+  else quiet();
+}
+
+function download(name, content) {
+  const link = element("a", { download: name, href: URL.createObjectURL(content) });
   link.click();
   setTimeout(() => URL.revokeObjectURL(link.href), 1000);
 }
 
+async function saveStill() {
+  const lines = prompts.map((prompt) => [shown(prompt.text), `rgb(${prompt.color})`]);
+  download("scene.png", await view.picture(lines));
+}
+
 async function copyLink() {
-  writeAddress();
+  keepAddress();
   await navigator.clipboard.writeText(location.href);
   say("The link is in the clipboard: it opens what you see.");
 }
 
-/** Show the scene in the chosen photo's lighting. */
-async function light() {
-  const photo = $("look").value;
+/** Show the scene in a photo's lighting, which the user chose. */
+async function chooseLook(photo) {
+  chosenLook = photo in about.looks ? photo : "";
+  await light(chosenLook);
+}
+
+/** Show the scene in a photo's lighting. */
+async function light(photo) {
+  $("look").value = photo;
   const colors = photo ? new Uint8Array(await (await fetched(about.looks[photo])).arrayBuffer()) : view.own;
-  if ($("look").value === photo) view.light(colors); // unless a later choice has been read in the meantime
+  if ($("look").value === photo && view.plain !== colors) view.light(colors); // unless a later choice has been read in the meantime
+}
+
+function hideFloaters() {
+  if (!view.floats) return;
+  const limit = 255 - Math.round(2.55 * Number($("hide").value));
+  view.hide(view.floats, limit);
+  if (about.words) think("hide", { floats: view.floats, limit });
 }
 
 // ── start ──
@@ -395,13 +546,20 @@ async function fetched(name) {
 
 async function open() {
   about = await (await fetched("scene.json")).json();
+  kept = new Kept(about);
   document.title = $("title").textContent = about.title;
   $("credit").textContent = [about.credit, about.license, about.made, ...about.left_out].filter(Boolean).join("\n");
   $("lighting").hidden = !Object.keys(about.looks).length;
   $("look").append(...Object.keys(about.looks).map((name) => element("option", { value: name }, name)));
-  for (const control of [...$("ask").elements, $("not")]) control.disabled = !about.words;
+  for (const control of [...$("ask").elements, $("not"), $("teach")]) control.disabled = !about.words;
   const splats = await (await fetched("splats.bin")).arrayBuffer();
   view = new View(about, $("frame"));
+  photos = new Photos(about, view, (name) => attempt(() => light(name === null ? chosenLook : name in about.looks ? name : chosenLook)));
+  photos.changed = () => keepAddress();
+  steps = new Steps((hash) => attempt(() => apply(hash)), () => {
+    $("undo").disabled = !steps.past;
+    $("redo").disabled = !steps.future;
+  }); // prettier-ignore
   await view.show(splats);
   listen();
   return splats;
@@ -413,22 +571,42 @@ async function readMeaning(splats) {
   const { seconds, known } = await think("load", { description: about, splats });
   Object.assign(about, { known, seconds });
   say(explain(about));
+  attempt(suggest);
+}
+
+/** Read which Gaussians float, once the page answers. */
+async function readFloaters() {
+  view.floats = new Uint8Array(await (await fetched(about.floaters)).arrayBuffer());
+  $("floating").hidden = false;
+  hideFloaters();
+}
+
+/** Keep the eye in the free space from now on. */
+function limit(space) {
+  const { mover } = view, untouched = mover.address === mover.first;
+  mover.space = space;
+  if (untouched) mover.jump(mover.overviewStand()); // a narrow window may have room behind the overview's photo
 }
 
 /** Show the prompts in the address, or else those that the page opens with. */
 async function begin() {
   const turn = cleared;
-  addEventListener("hashchange", () => location.hash !== read && attempt(() => readAddress()));
-  if (location.hash.length > 1) return readAddress(turn);
+  view.mover.first = location.hash.length > 1 ? null : view.mover.address;
+  if (about.words) setTimeout(() => think("space").then(limit)); // behind the prompts
+  setTimeout(() => attempt(readFloaters));
+  if (about.hide) $("hide").value = 50;
+  if (location.hash.length > 1) return apply(location.hash, turn);
   for (const [text, ...negatives] of about.prompts) if (turn === cleared) await ask(asTyped({ text, negatives }), turn);
-  if (turn === cleared) settle();
+  if (turn === cleared) settle("");
 }
 
 const drawing = open(), reading = drawing.then(readMeaning);
 window.lang3dxl = {
   ready: reading.then(begin),
   ask: (typed) => ask(typed),
+  clear,
   whatIs,
+  prompts,
   get view() {
     return view;
   },

@@ -1,5 +1,6 @@
 // The Gaussians that a pixel shows, front to back, with their weights in the picture.
 import { floats } from "./decode.js";
+import { seenAt } from "./space.js";
 
 const BLUR = 0.3; // square pixels added to every splat's variance, as in training
 const MARGIN = 1.3; // half sizes of the picture beyond which a splat keeps its shape at this limit: see gaussians.py
@@ -65,4 +66,46 @@ export function gaussiansAt({ centers, axes, opacities }, { view, focal, width, 
     clear -= weight;
     return [i, weight];
   });
+}
+
+/** Compute the place of what a pixel shows: the center of the Gaussian with which half of its weight is reached. */
+export function middleOf({ centers }, hits) {
+  const total = hits.reduce((sum, [, weight]) => sum + weight, 0);
+  if (total < 0.1) return null;
+  let before = 0;
+  const [row] = hits.find(([, weight]) => (before += weight) >= total / 2);
+  return [0, 1, 2].map((axis) => centers[3 * row + axis]);
+}
+
+/** Choose the view in which most of the points ({ point, row }) are visible, the preferred ones first, then by how
+ * large they are there: { index, pixels: where the visible points lie, in shares of the view }; null without any. */
+export function bestPhoto(views, points, preferred) {
+  let best = null;
+  views.forEach((view, index) => {
+    let size = 0;
+    const pixels = [];
+    for (const { point, row } of points) {
+      const k = placeOf(view.rows, row), [x, y, depth] = seenAt(view, point);
+      if (k < 0 || !(depth > 0 && x > 0 && x < view.width && y > 0 && y < view.height)) continue;
+      pixels.push([x / view.width, y / view.height]);
+      size += view.sizes[view.codes[k]];
+    }
+    const rank = [pixels.length, preferred.includes(index) ? 1 : 0, size];
+    if (pixels.length && (!best || before(best.rank, rank))) best = { index, pixels, rank };
+  });
+  return best;
+}
+
+const before = (a, b) => a.find((value, k) => value !== b[k]) < b.find((value, k) => value !== a[k]);
+
+/** Find a row among ascending ones; −1 without it. */
+function placeOf(rows, row) {
+  let low = 0, high = rows.length - 1;
+  while (low <= high) {
+    const middle = (low + high) >> 1;
+    if (rows[middle] === row) return middle;
+    if (rows[middle] < row) low = middle + 1;
+    else high = middle - 1;
+  }
+  return -1;
 }

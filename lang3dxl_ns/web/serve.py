@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import socket
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from socketserver import TCPServer
@@ -24,8 +24,11 @@ _KINDS = {
     "css": "text/css; charset=utf-8",
     "js": "text/javascript; charset=utf-8",
     "json": "application/json",
+    "jpg": "image/jpeg",
     "txt": "text/plain; charset=utf-8",
 }
+_MOST_MARKS = 8_000_000
+"""Most bytes of a word's marks."""
 _BYTES = "application/octet-stream"
 _HEADERS = {
     "Cache-Control": "no-cache",
@@ -71,6 +74,10 @@ class PageServer(ThreadingHTTPServer):
             return HTTPStatus.OK, _KINDS["json"], json.dumps(answer).encode()
         if place.path == "/api/look":
             return HTTPStatus.OK, _BYTES, self.page.colors(values.get("photo", ""))
+        if place.path == "/api/floaters":
+            return HTTPStatus.OK, _BYTES, self.page.floaters()
+        if place.path == "/api/photo":
+            return HTTPStatus.OK, "image/jpeg", self.page.photo(values.get("name", ""))
         name = place.path.removeprefix("/") or "index.html"
         if name not in self.files:
             return HTTPStatus.NOT_FOUND, "text/plain", b"404\n"
@@ -92,11 +99,32 @@ class Handler(BaseHTTPRequestHandler):
 
     def do_GET(self) -> None:
         """Answer the request, unless access is refused."""
+        self._answer(lambda: self.server.answer(self.path))
+
+    def do_POST(self) -> None:
+        """Teach the scene a word, for a page of this server that may be used."""
+        self._answer(self._teach)
+
+    def _teach(self) -> tuple[HTTPStatus, str, bytes]:
+        size = int(self.headers.get("Content-Length") or 0)
+        # Browsers name the origin of every POST; other sites can't send JSON without asking first.
+        ours = self.headers.get("Origin") and self.headers.get("Content-Type") == _KINDS["json"]
+        if urlsplit(self.path).path != "/api/teach" or not ours or not 0 < size <= _MOST_MARKS:
+            self.close_connection = True  # what was sent is not read
+            raise UserError("this server takes the marks of a word from its own page alone")
+        try:
+            content = json.loads(self.rfile.read(size))
+        except RecursionError as error:
+            raise UserError("these are no marks of a word: load the page again") from error
+        return HTTPStatus.OK, _KINDS["json"], json.dumps(self.server.page.teach(content)).encode()
+
+    def _answer(self, answer: Callable[[], tuple[HTTPStatus, str, bytes]]) -> None:
         refused = self.server.access.refusal(self.path, self.headers)
         if refused is not None:
+            self.close_connection = self.command == "POST"
             return self._send(*refused)
         try:
-            status, kind, content = self.server.answer(self.path)
+            status, kind, content = answer()
         except (UserError, ValueError) as error:  # an impossible address raises ValueError
             status, kind = HTTPStatus.BAD_REQUEST, _KINDS["txt"]
             content = f"{error}".encode("utf-8", "replace")

@@ -1,12 +1,13 @@
-// The picture: splats drawn with WebGL (Spark, three.js), their colors, the camera and its flights.
-import { OrbitControls, PackedSplats, PerspectiveCamera, Scene, SparkRenderer, SplatMesh, Vector3, WebGLRenderer } from "./splats.js";
+// The picture: splats drawn with WebGL (Spark, three.js), their colors, and places on the screen.
+import { Mover, still } from "./move.js";
+import { PackedSplats, Scene, SparkRenderer, SplatMesh, Vector3, WebGLRenderer } from "./splats.js";
 
-const FLIGHT = 1200, WIDEST = 85, HEAT = 0.7, BLUR = 0.3; // milliseconds, degrees, opacity, square pixels
+const HEAT = 0.7, BLUR = 0.3; // opacity, square pixels
 const FLUENT = 40, COARSEST = 0.3, STILL = 150; // milliseconds of a frame, least share of pixels a side, milliseconds
-const still = matchMedia("(prefers-reduced-motion: reduce)");
 
 export class View extends EventTarget {
-  /** Fill an element. about: the page's description; frame: the element. Fires `moved`, `drawn` and `click`. */
+  /** Fill an element. about: the page's description; frame: the element. Fires `moved`, `drawn`, `click` and
+   * `double` (a double click). */
   constructor(about, frame) {
     super();
     Object.assign(this, { about, frame });
@@ -19,17 +20,13 @@ export class View extends EventTarget {
     this.scene = new Scene();
     this.spark = new SparkRenderer({ renderer: this.renderer, preBlurAmount, blurAmount, enableLod: false, onDirty: () => this.sorted() });
     this.scene.add(this.spark);
-    const start = this.standing(about.start), distance = start.position.distanceTo(start.target);
-    this.camera = new PerspectiveCamera(50, 1, 1e-3 * distance, 1e3 * distance);
-    this.camera.up.fromArray(about.up);
-    this.controls = new OrbitControls(this.camera, this.canvas);
-    this.controls.enableDamping = false;
-    this.controls.addEventListener("change", () => this.wake());
-    this.controls.addEventListener("start", () => Object.assign(this, { flight: null, held: true }));
-    this.controls.addEventListener("end", () => Object.assign(this, { held: false }));
+    this.mover = new Mover(about, this.canvas, frame, () => this.wake());
+    Object.assign(this, { camera: this.mover.camera, controls: this.mover.controls });
+    this.mover.addEventListener("grab", () => (this.held = true));
+    this.mover.addEventListener("release", () => (this.held = false));
     new ResizeObserver(() => this.resize()).observe(frame);
     this.resize();
-    this.place(this.standing(about.start));
+    this.mover.place(this.mover.overviewStand());
     this.listen();
   }
 
@@ -60,7 +57,7 @@ export class View extends EventTarget {
 
   /** Show heat: layers of { relevancy, threshold, peak, color }, the strongest where several match. */
   recolor(layers = []) {
-    const told = layers.flatMap(({ relevancy, threshold, color }) => [relevancy, threshold, color]);
+    const told = [this.limit, ...layers.flatMap(({ relevancy, threshold, color }) => [relevancy, threshold, color])];
     if (!this.splats || (told.length === this.layers?.length && told.every((value, k) => value === this.layers[k]))) return;
     Object.assign(this, { layers: told, shown: layers });
     for (let i = 0; i < this.plain.length / 4; i++) {
@@ -71,9 +68,15 @@ export class View extends EventTarget {
       const warmth = chosen && (best - chosen.threshold) / Math.max(chosen.peak - chosen.threshold, 1e-6);
       const share = chosen ? HEAT * (0.5 + 0.5 * Math.min(warmth, 1)) : 0;
       for (let k = 0; k < 3; k++) this.bytes[16 * i + k] = this.plain[4 * i + k] * (1 - share) + (chosen?.color[k] ?? 0) * share;
-      this.bytes[16 * i + 3] = this.plain[4 * i + 3];
+      this.bytes[16 * i + 3] = this.floats?.[i] > this.limit ? 0 : this.plain[4 * i + 3];
     }
     this.upload();
+  }
+
+  /** Hide the Gaussians that float more than a limit, 0…255; floats: how much each one does. */
+  hide(floats, limit) {
+    Object.assign(this, { floats, limit });
+    this.recolor(this.shown);
   }
 
   upload() {
@@ -81,64 +84,6 @@ export class View extends EventTarget {
     this.packed.needsUpdate = true;
     this.splats.updateVersion();
     this.wake();
-  }
-
-  // ── camera ──
-
-  /** Compute the viewpoint of a photo whose whole picture the window shows (up to a widest lens). target: point to
-   * orbit, moved onto the photo's axis; the scene's center by default. */
-  standing({ pose, fx, fy, cx, cy, width, height }, target = this.about.center) {
-    const [position, ahead] = [3, 2].map((k) => new Vector3(...pose.slice(0, 3).map((row) => (k === 3 ? row[3] : -row[2]))));
-    const distance = Math.max(new Vector3(...target).sub(position).dot(ahead), 0.05);
-    const high = Math.max(cy, height - cy) / fy, wide = Math.max(cx, width - cx) / fx;
-    const fov = (360 / Math.PI) * Math.atan(Math.max(high, wide / (this.frame.clientWidth / this.frame.clientHeight)));
-    return { position, target: position.clone().addScaledVector(ahead, distance), fov: Math.min(fov, Math.max(WIDEST, (360 / Math.PI) * Math.atan(high))) };
-  }
-
-  get stand() {
-    return { position: this.camera.position.clone(), target: this.controls.target.clone(), fov: this.camera.fov };
-  }
-
-  place({ position, target, fov }) {
-    this.camera.position.copy(position);
-    this.controls.target.copy(target);
-    this.camera.fov = fov;
-    this.camera.updateProjectionMatrix();
-    this.controls.update();
-    this.wake();
-  }
-
-  /** The viewpoint as text, seven numbers: position, orbit center, field of view. */
-  get address() {
-    const { position, target, fov } = this.stand;
-    return [...position.toArray(), ...target.toArray(), fov].map((value) => +value.toPrecision(5)).join();
-  }
-
-  set address(text) {
-    const numbers = text.split(",").map(Number);
-    if (numbers.length !== 7 || !numbers.every(Number.isFinite) || !(numbers[6] > 1 && numbers[6] < 170)) return;
-    const [position, target] = [0, 3].map((k) => new Vector3(...numbers.slice(k, k + 3)));
-    if (position.distanceTo(target) > 0) this.place({ position, target, fov: numbers[6] });
-  }
-
-  /** Fly to a photo's viewpoint, around the target rather than through it. */
-  flyTo(photo, target) {
-    this.flight = { from: this.stand, to: this.standing(photo, target), start: performance.now() };
-    this.wake();
-  }
-
-  overview() {
-    this.flyTo(this.about.start);
-  }
-
-  advance(now) {
-    const { from, to, start } = this.flight, time = still.matches ? 1 : Math.min((now - start) / FLIGHT, 1);
-    const eased = time * time * (3 - 2 * time), target = from.target.clone().lerp(to.target, eased);
-    const [here, there] = [from, to].map((stand) => stand.position.clone().sub(stand.target));
-    const distance = here.length() ** (1 - eased) * there.length() ** eased;
-    const offset = here.normalize().lerp(there.normalize(), eased).normalize().multiplyScalar(distance);
-    if (time === 1) this.flight = null;
-    this.place(time === 1 ? to : { position: target.clone().add(offset), target, fov: from.fov + (to.fov - from.fov) * eased });
   }
 
   // ── frames ──
@@ -157,15 +102,14 @@ export class View extends EventTarget {
 
   /** Whether nothing is left to draw. */
   get resting() {
-    return !this.flight && !this.changed && this.sharp && !this.drawing;
+    return !this.mover.flight && !this.mover.striding && !this.changed && this.sharp && !this.drawing;
   }
 
   step(now) {
     this.asked = false;
     if (this.lost) return; // until the browser restores the context
     if (!this.splats || !this.drawn()) return this.splats && this.request();
-    if (this.flight) this.advance(now);
-    this.controls.update();
+    this.mover.update(now);
     if (this.changed) {
       this.draw(Math.max(Math.min(Math.sqrt(FLUENT / this.cost), 1), COARSEST));
       this.dispatchEvent(new Event("moved"));
@@ -225,7 +169,7 @@ export class View extends EventTarget {
   /** Project a point of the world to a pixel; null behind the camera. */
   pixel(point) {
     const seen = new Vector3(...point).project(this.camera);
-    if (seen.z > 1) return null;
+    if (!(seen.z <= 1) || !Number.isFinite(seen.x + seen.y)) return null;
     return [((seen.x + 1) / 2) * this.frame.clientWidth, ((1 - seen.y) / 2) * this.frame.clientHeight];
   }
 
@@ -239,37 +183,19 @@ export class View extends EventTarget {
   }
 
   listen() {
-    let down = null;
+    let down = null, before = null;
+    const near = (one, other) => Math.hypot(one.clientX - other.clientX, one.clientY - other.clientY) < 6;
     this.canvas.addEventListener("pointerdown", (event) => (down = event.isPrimary ? event : null));
     this.canvas.addEventListener("pointerup", (event) => {
-      const near = down && Math.hypot(event.clientX - down.clientX, event.clientY - down.clientY) < 6;
-      if (!near || event.timeStamp - down.timeStamp > 600 || event.button > 0) return;
+      if (!down || !near(event, down) || event.timeStamp - down.timeStamp > 600 || event.button > 0) return;
       const corner = this.canvas.getBoundingClientRect();
-      const [x, y] = [event.clientX - corner.left, event.clientY - corner.top];
-      this.dispatchEvent(new CustomEvent("click", { detail: { x, y, without: event.altKey } }));
+      const detail = { x: event.clientX - corner.left, y: event.clientY - corner.top, without: event.altKey };
+      const again = before && near(event, before) && event.timeStamp - before.timeStamp < 400;
+      before = again ? null : event;
+      this.dispatchEvent(new CustomEvent(again ? "double" : "click", { detail }));
     });
     this.canvas.addEventListener("webglcontextlost", () => (this.drawing = null));
     this.canvas.addEventListener("webglcontextrestored", () => this.upload());
-    this.frame.addEventListener("keydown", (event) => this.steer(event));
-  }
-
-  /** Steer by keys: arrows turn, + and − go closer and away, Home shows the overview. */
-  steer(event) {
-    if (event.ctrlKey || event.metaKey || event.altKey) return; // a shortcut of the browser
-    const turns = { ArrowLeft: [-0.1, 0], ArrowRight: [0.1, 0], ArrowUp: [0, 0.1], ArrowDown: [0, -0.1] }[event.key];
-    const zoom = { "+": 0.9, "=": 0.9, "-": 1.1 }[event.key], { target } = this.controls;
-    if (event.key === "Home") this.overview();
-    else if (turns || zoom) {
-      const offset = this.camera.position.clone().sub(target).multiplyScalar(zoom ?? 1);
-      if (turns) {
-        const side = this.camera.up.clone().cross(offset).normalize(), turned = offset.clone().applyAxisAngle(side, -turns[1]);
-        if (turned.angleTo(this.camera.up) > 0.05 && turned.angleTo(this.camera.up) < 3.09) offset.copy(turned);
-        offset.applyAxisAngle(this.camera.up, turns[0]);
-      }
-      this.flight = null;
-      this.place({ ...this.stand, position: target.clone().add(offset) });
-    } else return;
-    event.preventDefault();
   }
 
   /** Draw the picture as a PNG, with lines of text ([text, color]) below. */

@@ -92,7 +92,7 @@ export class Vocabulary {
   /** Look up any phrase in the same way; null if this page doesn't know it. */
   async phrase(text) {
     const plain = [...tidy(text)].slice(0, MOST_TEXT).join(""), known = this.place(plain);
-    if (!this.live || this.taught[this.index.get(plain.toLowerCase())]) return known === undefined ? null : this.word(known);
+    if (!this.live) return known === undefined ? null : this.word(known);
     if (!this.encoded.has(plain)) {
       const answer = await fetch(`api/encode?text=${encodeURIComponent(plain)}`);
       if (!answer.ok) throw new Error(await answer.text());
@@ -112,6 +112,11 @@ export class Vocabulary {
   /** Return whether a prompt means the same as a common word. */
   isSame(anchor, name) {
     return this.anchors[anchor].includes((this.words[this.place(name)] ?? name).toLowerCase());
+  }
+
+  /** Ask the live server anew about a phrase. */
+  forget(text) {
+    this.encoded.delete([...tidy(text)].slice(0, MOST_TEXT).join(""));
   }
 
   /** Find the words spelled most like a phrase, or contained in it. */

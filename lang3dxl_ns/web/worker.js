@@ -3,11 +3,13 @@ import { Answers } from "./answer.js";
 import { decodedRows, shippedRows } from "./decode.js";
 import { boxAround, massOf, rankViews, readViews } from "./find.js";
 import { likeness } from "./like.js";
-import { gaussiansAt, unpackSplats } from "./pick.js";
+import { bestPhoto, gaussiansAt, middleOf, unpackSplats } from "./pick.js";
+import { freeSpace } from "./space.js";
 import { Vocabulary } from "./vocabulary.js";
 
 const EXAMPLE = 5; // number of Gaussians that represent a clicked place
-let about, answers, vocabulary, geometry, views, mass;
+const INSIDE = 60; // Gaussians that represent an outlined place
+let about, answers, vocabulary, geometry, views, mass, opacities;
 
 /** Look up phrases; return their numbers, and the first phrase that is unknown. */
 async function understood(phrases) {
@@ -50,6 +52,7 @@ const jobs = {
       : shippedRows(words, await file("rows.bin"));
     answers = new Answers(rows, vocabulary, words);
     geometry = unpackSplats(splats);
+    opacities = geometry.opacities;
     views = readViews(about, await file("views.bin")).map((view) => ({
       ...view,
       pose: view.pose.map((row, axis) => (axis < 3 ? [...row.slice(0, 3), row[3] - about.center[axis]] : row)),
@@ -88,6 +91,45 @@ const jobs = {
     }
     if (covered < about.words.covered) return { words: [], rows: [] };
     return { words: answers.naming(blend, most), rows: hits.sort((a, b) => b[1] - a[1]).slice(0, EXAMPLE).map(([i]) => i) };
+  },
+
+  /** Hide the Gaussians that float more than a limit, 0…255, from clicks. */
+  hide({ floats, limit }) {
+    geometry = { ...geometry, opacities: opacities.map((opacity, i) => (floats[i] > limit ? 0 : opacity)) };
+    return {};
+  },
+
+  /** Find the free space in the world's frame; null where no view tells. */
+  space() {
+    const space = freeSpace(views, geometry.centers);
+    return space && { ...space, low: space.low.map((value, axis) => value + about.center[axis]) };
+  },
+
+  /** Find the point of the world at a pixel; null where nothing is. */
+  point({ camera, x, y }) {
+    const middle = middleOf(geometry, gaussiansAt(geometry, camera, x, y, about.antialiased));
+    return middle && middle.map((value, axis) => value + about.center[axis]);
+  },
+
+  /** Mark pixels: the Gaussians that represent them, and each pixel's place in one photo that shows them all well, or
+   * most of them. prefer: numbers of photos that should be taken if they show them. */
+  mark({ camera, pixels, prefer, most = EXAMPLE }) {
+    const weights = new Map(), points = [];
+    for (const [x, y] of pixels) {
+      const hits = gaussiansAt(geometry, camera, x, y, about.antialiased).filter(([i]) => answers.rows.scales[i]);
+      const strong = hits.sort((a, b) => b[1] - a[1]).slice(0, EXAMPLE);
+      for (const [i, weight] of strong) weights.set(i, (weights.get(i) ?? 0) + weight);
+      if (strong.length) points.push({ point: middleOf(geometry, hits), row: strong[0][0] });
+    }
+    const rows = [...weights].sort((a, b) => b[1] - a[1]).slice(0, pixels.length > 1 ? INSIDE : most).map(([i]) => i);
+    const found = bestPhoto(views, points, prefer.map((name) => views.findIndex((view) => view.name === name)));
+    return { rows, photo: found && views[found.index].name, points: found?.pixels ?? [] };
+  },
+
+  /** Look phrases up anew, once the scene has learned or forgotten them. */
+  forget({ texts }) {
+    for (const text of texts) vocabulary.forget(text);
+    return {};
   },
 
   offered: ({ typed }) => vocabulary.offered(typed),

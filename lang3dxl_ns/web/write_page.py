@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -17,25 +17,19 @@ from torch import Tensor
 from lang3dxl_ns.common.console import tracked
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import make_folder, write_atomically
+from lang3dxl_ns.common.pictures import PHOTO_SUFFIXES
 from lang3dxl_ns.files.scene_file import Provenance
 from lang3dxl_ns.query import view_ranking
 from lang3dxl_ns.query.doubt import BEST, DOUBTFUL, DOUBTFUL_TAUGHT, LEAST_PEAK
 from lang3dxl_ns.query.heat_maps import PROMPT_COLORS
 from lang3dxl_ns.query.language import TABLE
-from lang3dxl_ns.query.question import EVEN, SHARE
+from lang3dxl_ns.query.negatives import CLEAR, NOTHING, competitors
 from lang3dxl_ns.query.scene import NO_SEMANTICS, Scene
 from lang3dxl_ns.query.text import Prompt, tidy
+from lang3dxl_ns.query.thresholds import EVEN, SHARE
 from lang3dxl_ns.query.trust import ALIKE, ANCHORS, CLEARLY, FAINT, FAR, STRICTER, STRICTEST
 from lang3dxl_ns.query.visibility import spread
-from lang3dxl_ns.query.vocabulary import (
-    CLEAR,
-    NOTHING,
-    common_words,
-    competitors,
-    same_thing,
-    shipped_vocabulary,
-)
-from lang3dxl_ns.scene.photo_folder import PHOTO_SUFFIXES
+from lang3dxl_ns.query.vocabulary import common_words, same_thing, shipped_vocabulary
 from lang3dxl_ns.web.pack import (
     LEAST_PIXELS,
     PIXEL_STEPS,
@@ -47,7 +41,9 @@ from lang3dxl_ns.web.pack import (
     pack_splats,
     pack_view,
 )
-from lang3dxl_ns.words.taught_words import known_word
+from lang3dxl_ns.web.photos import extent, photo_json, photos_shown, small_photo
+from lang3dxl_ns.web.teach import PageWords
+from lang3dxl_ns.words.taught_words import TaughtWord, known_word
 
 _HERE = Path(__file__).parent
 _INDEX = _HERE / "index.html"
@@ -83,8 +79,14 @@ class Page:
     """Title, credit and license shown on the page."""
     look: str | None = None
     """Training photo whose lighting is shown; default: the overview photo."""
+    photos: Path | None = None
+    """Folder of the photos, of which the page shows small copies; if None, it shows their cameras alone."""
+    hide_floaters: bool = False
+    """Whether the page opens with floaters hidden."""
     live: bool = False
     """Whether a server encodes any other text (`answer`)."""
+    own_words: PageWords = field(default_factory=PageWords)
+    """Words that are taught from a live page."""
     left_out: list[str] = field(default_factory=list)
     """Sentences about what the files leave out because of its size."""
 
@@ -126,6 +128,10 @@ class Page:
             "prompts": _phrases(self.prompts),
             "words": None,
         }
+        files |= self._photos(about)
+        about["floaters"], about["hide"] = "api/floaters" if self.live else "floaters.bin", self.hide_floaters
+        if not self.live:
+            files["floaters.bin"] = self.floaters()
         about["looks"] = {name: f"api/look?photo={quote(name)}" for name in self._looks}
         if not self.live:  # without a server the lightings are files, read when they are chosen
             chosen = self._within_limits("lightings", self._looks, [4 * len(scene.splats)] * len(self._looks))
@@ -153,6 +159,22 @@ class Page:
             about["foreground"] = _phrases(self._foreground)
         about["left_out"] = self.left_out
         files["scene.json"] = json.dumps(about).encode()
+        return files
+
+    def _photos(self, about: dict[str, Any]) -> dict[str, bytes]:
+        """Describe the photos' cameras and what the overview shows, and make small photos if asked for."""
+        scene, names, files = self.scene, dict[str, str](), dict[str, bytes]()
+        shown = photos_shown(scene)
+        if self.photos is not None and self.live:
+            names = {photo.name: f"api/photo?name={quote(photo.name)}" for photo in shown}
+        elif self.photos is not None:
+            made = {p.name: small_photo(p, self.photos) for p in tracked(shown, "reading photos")}
+            chosen = self._within_limits("photos", list(made), list(map(len, made.values())))
+            names = {name: f"photo{i}.jpg" for i, name in enumerate(chosen)}
+            files = {file: made[name] for name, file in names.items()}
+        about["cameras"] = [photo_json(photo, names.get(photo.name)) for photo in shown]
+        about["extent"] = extent(scene)
+        about["source"] = {"scene": Path(scene.file.data).name, "clip": scene.file.clip_identity}
         return files
 
     def _within_limits(self, what: str, names: list[str], sizes: list[int]) -> list[str]:
@@ -187,8 +209,7 @@ class Page:
             elif len(against) < len(negatives):
                 special[i] = [[len(negatives) + i], against]
             if known is not None:  # what examples taught, in the scene's own numbers
-                vector = meaning.of_texts(known.vector[None].to(self.scene.device))[0].tolist()
-                learned[i] = {"vector": vector, "bias": known.bias, "text": known.text, "doubt": known.doubt}
+                learned[i] = self._taught(meaning, known)
         described = {"negatives": negatives, "words": words, "naming": len(naming), "special": special}
         described["nothing"] = [i for i, phrase in enumerate(negatives) if phrase in NOTHING]
         described["taught"] = learned
@@ -221,7 +242,29 @@ class Page:
         near, against = self._meant(self._meaning, text)
         vector = self.scene.text.vectors([text]).to(self.scene.device)
         own = self._meaning.of_texts(vector)[0].tolist()
-        return {"own": own, "near": near.tolist(), "against": against}
+        told: dict[str, Any] = {"own": own, "near": near.tolist(), "against": against}
+        known = self.scene.words.get(known_word(text))
+        return told if known is None else told | {"taught": self._taught(self._meaning, known)}
+
+    def _taught(self, meaning: PackedMeaning, word: TaughtWord) -> dict[str, Any]:
+        """Express what examples taught in this scene's own numbers."""
+        vector = meaning.of_texts(word.vector[None].to(self.scene.device))[0].tolist()
+        return {"vector": vector, "bias": word.bias, "text": word.text, "doubt": word.doubt}
+
+    def teach(self, content: Mapping[str, Any]) -> dict[str, Any]:
+        """Teach the scene a word that is marked in the page; see `PageWords.teach`."""
+        self.scene, told = self.own_words.teach(self.scene, content)
+        return {"told": told}
+
+    def photo(self, name: str) -> bytes:
+        """Read a small copy of a photo. Raises UserError if there is none."""
+        if self.photos is None:
+            raise UserError("the photos are not at hand: name their folder with --photos")
+        return small_photo(self.scene.file.photo(name), self.photos)
+
+    def floaters(self) -> bytes:
+        """Compute how surely each Gaussian is a floater, a byte each."""
+        return (self.scene.floating * 255).round().byte().cpu().numpy().tobytes()
 
     def colors(self, photo: str) -> bytes:
         """Compute every Gaussian's color and opacity in a photo's look. Raises UserError if there is none."""
@@ -259,10 +302,19 @@ def write_page(page: Page, folder: Path) -> int:
     taken = [path.name for path in here if path.name in names or path.suffix.lower() in other]
     if taken and not ours:
         raise UserError(f"{folder} holds {taken[0]}, which is not a scene's page: name a folder of its own")
-    files = page.files()
+    files, earlier = page.files(), _photos_of(folder)
     for name, content in files.items():
         write_atomically(folder / name, content)
     for path in here:  # of the page that this one replaces
-        if path.suffix == ".bin" and path.name not in files:
+        if (path.suffix == ".bin" or path.name in earlier) and path.name not in files:
             path.unlink()
     return sum(map(len, files.values()))
+
+
+def _photos_of(folder: Path) -> set[str]:
+    """Return the names of the photos of the page in a folder, if it holds one."""
+    try:
+        cameras = json.loads((folder / "scene.json").read_bytes())["cameras"]
+        return {f"photo{i}.jpg" for i in range(len(cameras))} & {camera["photo"] for camera in cameras}
+    except (OSError, ValueError, LookupError, TypeError):
+        return set()  # no page, an older one, or a damaged one

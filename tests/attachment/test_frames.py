@@ -12,16 +12,16 @@ from scipy.spatial.transform import Rotation
 
 from lang3dxl_ns.attachment import frames
 from lang3dxl_ns.attachment.frames import Fit, camera_in, find_frame
-from lang3dxl_ns.attachment.known_frames import RUN_TRANSFORM, known_frames
+from lang3dxl_ns.attachment.known_frames import RUN_TRANSFORM, known_frames, registered_frames
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.preparation.photo_collection import read_collection
 from lang3dxl_ns.rendering import render
+from lang3dxl_ns.scene.capture import open_capture
 
 
 @pytest.fixture(scope="module")
 def collection(tmp_path_factory):
     folder = write_scene(tmp_path_factory.mktemp("box") / "scene", size=(120, 90), photos=8, points=400)
-    return read_collection(folder)
+    return open_capture(folder)
 
 
 def moved(similarity):
@@ -125,7 +125,7 @@ def test_a_transforms_json_is_read_like_the_colmap_model(collection, tmp_path):
         written.append({"file_path": f"./{photo.name}", "transform_matrix": pose.tolist()})
     shared = {"fl_x": lens.fx, "fl_y": lens.fy, "cx": lens.cx, "cy": lens.cy, "w": 120, "h": 90}
     (tmp_path / "transforms.json").write_text(json.dumps({**shared, "frames": written}))
-    found = read_collection(tmp_path)
+    found = open_capture(tmp_path)
     assert [photo.name for photo in found.photos] == [photo.name for photo in collection.photos]
     assert [photo.lens for photo in found.photos] == [photo.lens for photo in collection.photos]
     for name, tracked in found.reconstruction.photos.items():
@@ -148,9 +148,20 @@ def test_a_damaged_photo_or_mask_is_not_compared(tmp_path, damaged):
     photo = tmp_path / "images" / "photo_000.jpg"
     if damaged == "images":
         photo.write_bytes(photo.read_bytes()[:2000])
-    collection = read_collection(tmp_path)
+    collection = open_capture(tmp_path)
     assert find_frame(box_splat(), collection, tmp_path / "a.ply").fits
     for photo in (tmp_path / "images").iterdir():
         photo.write_bytes(photo.read_bytes()[:1500])
     with pytest.raises(UserError, match="can't read"):
         find_frame(box_splat(), collection, tmp_path / "a.ply")
+
+
+@pytest.mark.parametrize("kept", [(1, 0, 1), (1, 0, 0), (0, 0, 0)])
+def test_flat_and_thin_shapes_are_aligned_or_a_line_says_that_they_cannot_be(kept, capsys):
+    draw = np.random.default_rng(0)
+    points, means = draw.normal(size=(200, 3)), draw.normal(size=(300, 3)) * kept
+    found = registered_frames(points, means)
+    assert all(np.isfinite(fit).all() and np.linalg.det(fit) > 0 for fit in found.values())
+    assert found or "can't be aligned" in capsys.readouterr().out
+    assert registered_frames(points[:9], means) == {}
+    assert "too few to align by shape: 9 points" in capsys.readouterr().out.replace("\n", " ")

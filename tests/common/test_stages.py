@@ -51,6 +51,22 @@ def test_at_a_steady_pace_every_estimate_is_right(steps, capsys, clock):
         assert int(line.split("about ")[1].split()[0]) == pytest.approx(truth, abs=1.01)
 
 
+def test_estimates_follow_a_change_of_pace(capsys, clock):
+    """Another program comes when a third is done, and slows everything by 8: two minutes later, estimates
+    know it; nothing is announced in between at a wrong pace for long."""
+    stages = Stages(SHARES)
+    with stages.stage("cook"):
+        for step in range(3000):
+            clock[0] += 0.1 if step < 1000 else 0.8
+            stages.progress((step + 1) / 3000)
+    lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("cook: ")]
+    for line in lines:
+        done = int(line.split()[1]) / 100
+        if done >= 0.4:
+            truth = 0.8 * 3000 * (1 - done + 0.6) / 60
+            assert truth / 2 < int(line.split("about ")[1].split()[0]) < 2 * truth
+
+
 def test_a_short_stage_is_silent(capsys, clock):
     stages = Stages(SHARES)
     with stages.stage("serve"):

@@ -8,7 +8,7 @@ from functools import partial
 import torch
 
 from lab.numerics.measure import Bounds, Case, Maps, Problem
-from lang3dxl_ns.training.learn_codes import sharpen
+from lang3dxl_ns.training.sharpening import sharpen
 
 COUNT, CHANNELS, AXES, KINDS = 4_000, 32, 8, 40
 BOUNDS = {"float32": Bounds(2e-6, 5e-7), "float64": Bounds(1e-12, 1e-12)}

@@ -9,7 +9,7 @@ from lang3dxl_ns.files.read_splats import read_splats
 from lang3dxl_ns.files.splat_file import write_splats
 from lang3dxl_ns.rendering import Gaussians, rasterize, spherical_harmonics
 from lang3dxl_ns.scene.camera import Lens
-from lang3dxl_ns.training.initialization import FREE, LONGEST, NEEDLE, keep_in_bounds
+from lang3dxl_ns.training.gaussians import FREE, LONGEST, NEEDLE, keep_in_bounds
 
 SKY = 40
 """Few, so that they are large."""

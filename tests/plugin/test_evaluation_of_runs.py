@@ -17,6 +17,10 @@ from lang3dxl_ns.evaluation.score_scene import score_scene
 from lang3dxl_ns.plugin.dataparser import PhotoCollectionDataParserConfig
 from lang3dxl_ns.plugin.load_scene import load_run
 from lang3dxl_ns.plugin.trainer_config import open_run
+from lang3dxl_ns.scene.camera import Lens
+from lang3dxl_ns.scene.capture import Capture, CaptureSettings
+from lang3dxl_ns.scene.colmap import Reconstruction
+from lang3dxl_ns.scene.photo import Photo
 
 
 def label(scene, folder, numbers):
@@ -158,8 +162,11 @@ def test_a_listed_photo_that_is_not_there_is_named(scene, tmp_path):
 @pytest.mark.parametrize("name", ["seq/b.jpg", "seq/b", "b.jpg", "b"])
 def test_a_photo_may_be_listed_without_its_folder_and_its_suffix(tmp_path, name):
     (tmp_path / "held_out.txt").write_text(name)
-    parser = PhotoCollectionDataParserConfig(held_out=tmp_path / "held_out.txt").setup()
-    assert parser._held_out(["seq/a.jpg", "seq/b.jpg"]) == [1]
+    lens, nothing = Lens(4, 4, 4.0, 4.0, 2.0, 2.0), np.zeros((0, 3))
+    photos = [Photo(known, tmp_path / known, None, lens) for known in ("seq/a.jpg", "seq/b.jpg")]
+    settings = CaptureSettings(held_out=tmp_path / "held_out.txt")
+    capture = Capture(tmp_path, photos, Reconstruction({}, nothing, nothing), settings=settings)
+    assert capture.split == (("seq/a.jpg",), ("seq/b.jpg",))
 
 
 def test_folders_of_pt_ovs_are_read_as_published(scene, tmp_path):

@@ -7,7 +7,7 @@ from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.components.sky import OPACITY, Sky
 from lang3dxl_ns.plugin.model import Lang3DXLModel
 from lang3dxl_ns.rendering import Gaussians
-from lang3dxl_ns.training.initialization import sphere_around
+from lang3dxl_ns.training.gaussians import sphere_around
 
 COUNT = 200
 ONE_LIGHT = {"pipeline__model__appearance__use": "off"}

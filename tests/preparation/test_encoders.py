@@ -13,7 +13,13 @@ from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.plugin.datamanager import Lang3DXLDataManagerConfig
 from lang3dxl_ns.preparation import encoders
 from lang3dxl_ns.preparation.encoders import load_dense_encoder, load_image_text_encoder
-from lang3dxl_ns.preparation.model_files import check_encoders, find_model, option_prefix
+from lang3dxl_ns.preparation.model_files import (
+    USUAL_CLIP,
+    check_encoders,
+    find_model,
+    option_prefix,
+    usual_clip,
+)
 
 TEXTS = ["a rose window", "minaret", "the dome of a mosque, seen from far away in the evening light"]
 
@@ -270,3 +276,14 @@ def test_an_encoder_that_is_here_is_not_asked_for(tiny_clip):
         check_encoders(str(tiny_clip), DINO)
     assert "openai" not in str(told.value)
     assert "--pipeline.datamanager.clip DIR" not in str(told.value)
+
+
+def test_without_a_download_the_clip_is_the_built_in_one(monkeypatch, tmp_path):
+    import huggingface_hub
+
+    assert usual_clip("auto") == "builtin" and usual_clip("some/clip") == "some/clip"
+    cached = {"model.safetensors": str(tmp_path), "config.json": str(tmp_path)}
+    monkeypatch.setattr(huggingface_hub, "try_to_load_from_cache", lambda _, name: cached.get(name))
+    assert usual_clip("auto") == USUAL_CLIP
+    del cached["model.safetensors"]  # an interrupted download
+    assert usual_clip("auto") == "builtin"

@@ -3,7 +3,8 @@ whole."""
 
 import pytest
 
-from lang3dxl_ns.query.vocabulary import NEGATIVES, competitors, synonyms_of
+from lang3dxl_ns.query.negatives import NEGATIVES, competitors
+from lang3dxl_ns.query.vocabulary import synonyms_of
 
 
 def against(text: str) -> set[str]:

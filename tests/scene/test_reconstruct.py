@@ -246,7 +246,7 @@ def test_what_makes_no_scene_is_told_in_words(tmp_path, count, paint, message):
     assert not (tmp_path / "data" / "sparse").exists()
 
 
-@pytest.mark.parametrize("changes", [{"max_size": 5}, {"features": 0}])
+@pytest.mark.parametrize("changes", [{"max_size": 5}, {"max_features": 0}])
 def test_sizes_that_crash_colmap_are_refused(tmp_path, changes):
     with pytest.raises(UserError, match="give a number from 100"):
         reconstruct_scene(tmp_path, None, ReconstructionSettings(**changes))

@@ -1,0 +1,409 @@
+"""Capture: a folder's photos with cameras, masks, points, split and frame, for training and for `attach`.
+
+A capture comes from a COLMAP model, a transforms.json, a folder of photos alone, or a video.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path, PurePosixPath
+from typing import Literal, NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float32, Float64, UInt8
+from numpy import ndarray as Array
+
+from lang3dxl_ns.common.console import say, some
+from lang3dxl_ns.common.errors import UserError, printable
+from lang3dxl_ns.common.files import expanded, read_names
+from lang3dxl_ns.scene.camera import camera_to_world
+from lang3dxl_ns.scene.colmap import Reconstruction, TrackedPhoto, photos_in_model, read_reconstruction
+from lang3dxl_ns.scene.companions import inside
+from lang3dxl_ns.scene.frame import COLMAP_UP, Center, Frame, Orientation, find_frame, lost_cameras
+from lang3dxl_ns.scene.masks import mask_folder
+from lang3dxl_ns.scene.names import resolve
+from lang3dxl_ns.scene.photo import Photo, upright_in_model
+from lang3dxl_ns.scene.photo_folder import extract_frames, find_photos, frames_folder, is_video, photos_below
+from lang3dxl_ns.scene.reconstruct import reconstruct_scene, shows_these
+from lang3dxl_ns.scene.transforms import TRANSFORMS, Transforms, read_transforms
+
+_MODEL_FOLDERS = (
+    *(Path("sparse/0"), Path("sparse"), Path("colmap/sparse/0"), Path("colmap/sparse"), Path("dense/sparse")),
+    *(Path("colmap"), Path(".")),
+)
+_OWN_MODEL = Path("lang3dxl_cache/reconstruction/sparse/0")
+"""Folder of a model that is reconstructed here, if sparse/ is taken."""
+_SPLIT_LISTS = ("train_list.txt", "validation_list.txt", "val_list.txt", "test_list.txt")
+"""Files of a folder that list the photos of a split, for nerfstudio."""
+
+
+class Split(NamedTuple):
+    """Names of the photos to train on, and of those held out. Under "all", both name every photo."""
+
+    train: tuple[str, ...]
+    held_out: tuple[str, ...]
+
+
+@dataclass
+class CaptureSettings:
+    """Where a capture's parts are, and how it is split and normalized."""
+
+    colmap_path: Path | None = None
+    """Folder of the COLMAP model, relative to the capture's; None: the first of the usual places."""
+    images_path: Path = Path("images")
+    """Folder of the model's photos, relative to the capture's; where it has none, the photos are found."""
+    masks_path: Path | None = Path("masks")
+    """Folder of foreground masks, relative to the capture's; None: no masks."""
+    held_out: Path | None = None
+    """Text file with names of the photos to hold out, in place of a rule."""
+    follow_links: bool = False
+    """Whether photos and masks may be symbolic links that leave their folder."""
+    eval_mode: Literal["fraction", "filename", "interval", "all"] = "interval"
+    """Rule for the held-out photos: a share of them, those with "eval" in their names, every
+    `eval_interval`-th one, or none."""
+    train_split_fraction: float = 0.9
+    """Share of the photos to train on, for the rule "fraction"."""
+    eval_interval: int = 8
+    """Distance of held-out photos in the order of names, for the rule "interval"."""
+    orientation_method: Orientation = "up"
+    """Direction that becomes z in training: see `find_frame`."""
+    center_method: Center = "poses"
+    """Origin in training: see `find_frame`."""
+    auto_scale_poses: bool = True
+    """Whether the farthest coordinate of a camera becomes 1 in training."""
+    scale_factor: float = 1.0
+    """Scale of the training frame in addition."""
+
+
+@dataclass(frozen=True, eq=False)
+class Capture:
+    """Photos on disk with their cameras and points, in the coordinates of the file that they come from."""
+
+    folder: Path
+    """Folder of the capture."""
+    photos: list[Photo]
+    """Usable photos with their masks, sorted by name."""
+    reconstruction: Reconstruction
+    """Poses of these photos, tracks, and points with colors."""
+    left_out: dict[str, str] = field(default_factory=dict)
+    """Photos that can't be used, with reasons."""
+    images: Path = Path()
+    """Folder that the photos' names are relative to."""
+    source: Path | None = None
+    """COLMAP model or transforms.json that it was read from."""
+    settings: CaptureSettings = field(default_factory=CaptureSettings)
+    transforms: Transforms | None = None
+    """Contents of the transforms.json, if it comes from one."""
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the usable photos."""
+        return [photo.name for photo in self.photos]
+
+    @cached_property
+    def split(self) -> Split:
+        """Photos to train on and photos held out, as lists in the folder say, or by the settings' rule.
+        Raises UserError if one of the two is empty, or a list names an unknown photo."""
+        train, held_out = self._listed_split() or self._split_by_rule()
+        for part, names in (("train", train), ("held-out", held_out)):
+            if not names:
+                raise UserError(
+                    f"the {part} split of {self.folder} has no photo (of {len(self.photos)} in all): add "
+                    "photos, "
+                    "or choose another split with `lang3dxl-colmap --eval-mode …` after all options"
+                )
+        return Split(train, held_out)
+
+    def _listed_split(self) -> Split | None:
+        """Split as the settings' list, the transforms.json or lists in the folder say; None without any."""
+        if self.settings.held_out is not None:
+            return self._of_lists(None, self._named(self.settings.held_out))
+        if self.transforms is not None and (self.transforms.train or self.transforms.held_out):
+            return self._of_lists(self.transforms.train, self.transforms.held_out)
+        lists = [self.folder / name for name in _SPLIT_LISTS if (self.folder / name).is_file()]
+        if not lists:
+            return None
+        parts = {path: self._named(path) for path in lists}
+        train, held_out = (
+            frozenset[str]().union(
+                *(names for path, names in parts.items() if path.name.startswith("train") is kind)
+            )
+            for kind in (True, False)
+        )
+        return self._of_lists(train or None, held_out or None)
+
+    def _of_lists(self, train: frozenset[str] | None, held_out: frozenset[str] | None) -> Split:
+        """Split by two lists. One that is missing holds all other photos."""
+        chosen = [n for n in self.names if (n in train if train else n not in (held_out or ()))]
+        others = [n for n in self.names if (n in held_out if held_out else n not in chosen)]
+        return Split(tuple(chosen), tuple(others))
+
+    def _named(self, path: Path) -> frozenset[str]:
+        """Read a list of photos, which may lack folders or endings. Raises UserError for an unknown one."""
+        forms = {
+            name: {
+                name,
+                str(PurePosixPath(name).with_suffix("")),
+                PurePosixPath(name).name,
+                PurePosixPath(name).stem,
+            }
+            for name in (*self.names, *self.left_out)
+        }
+        found = set()
+        for name in read_names(path):
+            fitting = [name] if name in forms else [known for known in forms if name in forms[known]]
+            if len(fitting) != 1:
+                fits = f"which fits {len(fitting)} photos of the scene: correct the list"
+                raise UserError(f"{path} names {name}, {fits}")
+            found.add(fitting[0])
+        return frozenset(found)
+
+    def _split_by_rule(self) -> Split:
+        names, settings = self.names, self.settings
+        if settings.eval_mode == "all":
+            return Split(tuple(names), tuple(names))
+        if settings.eval_mode == "fraction":
+            count = math.ceil(len(names) * settings.train_split_fraction)
+            chosen = {names[i] for i in np.linspace(0, len(names) - 1, count, dtype=int)} if names else set()
+        elif settings.eval_mode == "filename":
+            chosen = {name for name in names if "train" in PurePosixPath(name).name}
+            unknown = [n for n in names if n not in chosen and "eval" not in PurePosixPath(n).name]
+            if unknown:
+                raise UserError(f"--eval-mode filename: {unknown[0]} has neither train nor eval in its name")
+        else:
+            chosen = {name for i, name in enumerate(names) if i % settings.eval_interval}
+        return Split(tuple(n for n in names if n in chosen), tuple(n for n in names if n not in chosen))
+
+    @cached_property
+    def frame(self) -> Frame:
+        """Similarity from the file's coordinates to training's."""
+        settings = self.settings
+        return find_frame(
+            self._world_from_camera(self.names), self.reconstruction.points,
+            np.eye(3) if self.transforms is not None else COLMAP_UP,
+            settings.orientation_method, settings.center_method, settings.auto_scale_poses,
+            settings.scale_factor, )  # fmt: skip
+
+    @property
+    def recorded_frame(self) -> Frame:
+        """Similarity to training's coordinates from the original ones, which a transforms.json may have
+        moved."""
+        moved = self.transforms
+        if moved is None or (moved.applied is None and moved.applied_scale == 1):
+            return self.frame
+        return self.frame.after(
+            np.eye(4)[:3] if moved.applied is None else moved.applied, moved.applied_scale
+        )
+
+    def poses(self, names: Sequence[str]) -> Float32[Array, "n 3 4"]:
+        """Compute photos' poses in training's frame (camera → world; x right, y up, z backward)."""
+        return self.frame.poses(self._world_from_camera(names)).astype(np.float32)
+
+    @property
+    def seeds(self) -> tuple[Float32[Array, "m 3"], UInt8[Array, "m 3"]]:
+        """Points in training's frame, and their colors."""
+        points = self.frame.points(self.reconstruction.points)
+        return points.astype(np.float32), self.reconstruction.colors
+
+    def _world_from_camera(self, names: Sequence[str]) -> Float64[Array, "n 3 4"]:
+        views = np.array([self.reconstruction.photos[name].camera_from_world for name in names], np.float64)
+        return np.array([camera_to_world(torch.from_numpy(view)).numpy() for view in views]).reshape(-1, 3, 4)
+
+
+def open_capture(
+    data: str | Path,
+    settings: CaptureSettings | None = None,
+    cache_dir: Path | None = None,
+    may_reconstruct: bool = True,
+) -> Capture:
+    """Open a capture.
+
+    Args:
+        data: folder with a COLMAP model, with a transforms.json, or with photos alone; or a transforms.json,
+            or a video. Photos without poses are reconstructed, which takes minutes. settings: where its parts
+            are, and how it is split and normalized. cache_dir: folder of a reconstruction, if not
+            lang3dxl_cache in the folder. may_reconstruct: whether photos may be reconstructed, and frames of
+            a video extracted.
+
+    Raises:
+        UserError: there are no photos, or none of them can be used, or the file with their cameras is
+        damaged.
+    """
+    settings = settings or CaptureSettings()
+    folder, source = find_source(data, settings, cache_dir, may_reconstruct)
+    if source.suffix == ".json":
+        capture = _of_transforms(source, settings)
+    else:
+        capture = _of_model(folder, source, settings)
+    if not capture.photos:
+        first = next(iter(capture.left_out.items()), ("", "it lists none"))
+        raise UserError(
+            f"none of the {len(capture.left_out)} photos of {folder} can be used; the first: "
+            f"{': '.join(first)}. "
+            "Name the photos' folder with `lang3dxl-colmap --images-path FOLDER` after the other options"
+        )
+    return _without_lost_cameras(capture)
+
+
+def find_source(
+    data: str | Path, settings: CaptureSettings, cache_dir: Path | None = None, may_reconstruct: bool = True
+) -> tuple[Path, Path]:
+    """Find a capture's folder and its COLMAP model or transforms.json, or make a model. Raises UserError as
+    `open_capture` does."""
+    folder = expanded(data).absolute()
+    if is_video(folder) or (not folder.exists() and frames_folder(folder).is_dir()):
+        folder = extract_frames(folder) if may_reconstruct else frames_folder(folder)
+    if folder.suffix == ".json" and folder.is_file():
+        return folder.parent, folder
+    if not folder.is_dir():
+        raise UserError(f"{folder} is not a folder: pass the one that holds your photos as --data")
+    if settings.colmap_path is not None:
+        return folder, folder / settings.colmap_path
+    places = [*_MODEL_FOLDERS, _OWN_MODEL]
+    work = None if cache_dir is None else expanded(cache_dir).absolute() / "reconstruction"
+    if work is not None and shows_these(work, folder):
+        places.append(work / "sparse/0")
+    for place in places:
+        if any((folder / place / f"images{ending}").exists() for ending in (".bin", ".txt")):
+            return folder, folder / place
+    if (folder / TRANSFORMS).exists():
+        return folder, folder / TRANSFORMS
+    if may_reconstruct and find_photos(folder).names:
+        return reconstruct_scene(folder, cache_dir)
+    if may_reconstruct and not any(folder.iterdir()):
+        raise UserError(f"{folder} is empty: give the folder with your photos")
+    return folder, folder / _MODEL_FOLDERS[0]  # reading it tells what is missing
+
+
+# ── from a COLMAP model ─────────────────────────────────────────────────────────────────────────────────
+
+
+def _of_model(folder: Path, model: Path, settings: CaptureSettings) -> Capture:
+    found, images = read_reconstruction(model), folder / images_path(folder, settings.images_path)
+    links = settings.follow_links
+    exists = lambda name: _exists(images, name)  # noqa: E731
+    files, doubts = resolve(list(found.photos), exists, lambda: photos_below(images), "photos")
+    places = {name: files.get(name, name) for name in found.photos}
+    capture = _usable(folder, images, found, places, doubts, settings, links)
+    _mention_what_is_not_used(capture, model, set(places.values()))
+    return replace(capture, source=model)
+
+
+def _exists(folder: Path, name: str) -> bool:
+    """Return whether a name is that of a file, a link or something else in the folder."""
+    try:
+        path = inside(folder, name, follow_links=True)
+    except UserError:
+        return False
+    return path.is_symlink() or path.exists()
+
+
+def images_path(data: Path, named: Path = Path("images")) -> Path:
+    """Return the photos' folder relative to the scene's: `named` if it has photos, else one that has."""
+    if (data / named).is_dir() and any(photos_below(data / named)):
+        return named
+    found = find_photos(data)
+    return found.folder.relative_to(data) if found.names else named
+
+
+def _usable(
+    folder: Path,
+    images: Path,
+    found: Reconstruction,
+    files: dict[str, str],
+    doubts: dict[str, UserError],
+    settings: CaptureSettings,
+    links: bool,
+    masks_of: dict[str, Path] | None = None,
+) -> Capture:
+    """Match cameras with files on disk, by the names in `files`. Photos that can't be used are left out."""
+    masks = mask_folder(folder, settings.masks_path, links)
+    photos, left_out, kept = list[Photo](), dict[str, str](), dict[str, TrackedPhoto]()
+    for name, tracked in found.photos.items():
+        file = files[name]
+        path = images / file
+        try:
+            if name in doubts:
+                raise doubts[name]
+            if not inside(images, file, links).is_file():
+                raise UserError(f"there is no {path}")
+            turned = replace(upright_in_model(tracked, path), name=file)
+            mask = (masks_of or {}).get(name)
+            if mask is None and masks is not None:
+                mask = masks.find(file)
+            photos.append(Photo.from_model(turned, path, mask))
+            kept[file] = turned
+        except UserError as reason:
+            left_out[name] = str(reason)
+    if masks is not None and masks.count and photos and all(photo.mask_path is None for photo in photos):
+        say(
+            f"{masks.folder} has {masks.count} pictures, and none is named like a photo (such as "
+            f"{photos[0].name}): no mask is used. Name masks like the photos, with .png or .jpg"
+        )
+    photos.sort(key=lambda photo: photo.name)
+    kept = dict(sorted(kept.items()))
+    return Capture(folder, photos, replace(found, photos=kept), left_out, images, settings=settings)
+
+
+def _mention_what_is_not_used(capture: Capture, model: Path, listed: set[str]) -> None:
+    """Say which other models are beside the one in use, and which photos are missing from it."""
+    # COLMAP's mapper leaves its models in one folder: 0, 1, …
+    beside = sorted(model.parent.glob("[0-9]*")) if model.name.isdigit() else []
+    others = [f for f in beside if f != model and f.name.isdigit() and any(f.glob("images.*"))]
+    if others:
+        counts = (f"{f.name} with {photos_in_model(f)}" for f in others)
+        say(
+            f"{model.parent} has {len(others) + 1} models; used is {model.name} with "
+            f"{photos_in_model(model)} "
+            f"photos. There are also {', '.join(counts)}: choose with `lang3dxl-colmap --colmap-path FOLDER` "
+            "after all other options"
+        )
+    unknown = [name for name in photos_below(capture.images) if name not in listed]
+    if unknown:
+        say(
+            f"{len(unknown)} photos of {capture.images} are not in the COLMAP model and not used: "
+            f"{some(unknown)}"
+        )
+
+
+# ── from a transforms.json ──────────────────────────────────────────────────────────────────────────────
+
+
+def _of_transforms(path: Path, settings: CaptureSettings) -> Capture:
+    content = read_transforms(path)
+    found = Reconstruction(content.photos, content.points, content.colors)
+    files = {name: name for name in content.photos}
+    capture = _usable(path.parent, path.parent, found, files, {}, settings, True, content.masks)
+    left_out = {name: str(reason) for name, reason in content.left_out.items()} | capture.left_out
+    return replace(capture, left_out=left_out, source=path, transforms=content)
+
+
+# ── cameras that are lost ───────────────────────────────────────────────────────────────────────────────
+
+
+def _without_lost_cameras(capture: Capture) -> Capture:
+    """Leave out photos whose cameras stand so far from all others that their poses must be wrong."""
+    names = capture.names
+    centers = np.array([capture.reconstruction.photos[name].center for name in names])
+    lost = {names[i] for i in np.flatnonzero(lost_cameras(centers, capture.reconstruction.points))}
+    if not lost:
+        return capture
+    reason = "its camera stands over a hundred times as far away as the others: its pose is wrong"
+    kept = {name: photo for name, photo in capture.reconstruction.photos.items() if name not in lost}
+    return replace(
+        capture,
+        photos=[photo for photo in capture.photos if photo.name not in lost],
+        reconstruction=replace(capture.reconstruction, photos=kept),
+        left_out=capture.left_out | dict.fromkeys(sorted(lost), reason),
+    )
+
+
+def say_left_out(capture: Capture) -> None:
+    """Say which photos are left out, and why."""
+    if capture.left_out:
+        say(f"{len(capture.left_out)} photos of {capture.source} are left out:")
+        say(*(f"  {printable(name)}: {why}" for name, why in capture.left_out.items()))

@@ -1,0 +1,137 @@
+"""Frame of training: the similarity that turns a capture upright, centers it and scales it to unit size."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Bool, Float, Float64
+from numpy import ndarray as Array
+from scipy.spatial.transform import Rotation
+
+Orientation = Literal["pca", "up", "vertical", "none"]
+Center = Literal["poses", "focus", "none"]
+
+COLMAP_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+"""Rotation from COLMAP's usual y down to z up."""
+_LOST = 100
+"""Distance, relative to the typical one, from which a camera is lost: it sees the scene in ten pixels."""
+_MOST_LOST = 1 / 4
+"""Largest share of cameras that can be lost. Where more stand apart, they are another part of the scene."""
+_PARALLEL = 0.17
+"""Deviation of the cameras' right axes from a plane's normal (10 degrees) below which they are parallel."""
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """Similarity x ↦ scale · (transform · x), in float64: map coordinates are in the millions."""
+
+    transform: Float64[Array, "3 4"]
+    """Rotation and translation that precede the scale."""
+    scale: float
+
+    def points(self, points: Float[Array, "n 3"]) -> Float64[Array, "n 3"]:
+        """Transform points."""
+        return self.scale * (points @ self.transform[:, :3].T + self.transform[:, 3])
+
+    def poses(self, poses: Float[Array, "n 3 4"]) -> Float64[Array, "n 3 4"]:
+        """Transform poses (camera → world, any camera axes); their axes keep unit length."""
+        turned = self.transform[:, :3] @ poses[:, :, :3]
+        return np.concatenate([turned, self.points(poses[:, :, 3])[..., None]], axis=2)
+
+    def after(self, rotation: Float[Array, "3 4"], scale: float) -> Frame:
+        """Return the frame for coordinates to which another similarity of this form was applied first."""
+        turn, shift = self.transform[:, :3] @ rotation[:, :3], self.transform[:, :3] @ rotation[:, 3]
+        moved = shift + self.transform[:, 3] / scale
+        return Frame(np.column_stack([turn, moved]), self.scale * scale)
+
+
+def find_frame(
+    poses: Float[Array, "n 3 4"],
+    points: Float[Array, "m 3"],
+    axes: Float[Array, "3 3"],
+    orientation: Orientation = "up",
+    center: Center = "poses",
+    auto_scale: bool = True,
+    factor: float = 1.0,
+) -> Frame:
+    """Choose the frame of training.
+
+    Args:
+        poses: camera → world, the world being the capture's; camera axes x right, y up, z backward.
+        points: the capture's points, which tell whether the cameras stand apart.
+        axes: rotation of the world to z up that is applied first.
+        orientation: "up" turns the cameras' mean up axis to z; "vertical" turns the direction to z that is
+            orthogonal to their right axes; "pca" turns the principal axes of their positions to x, y, z.
+        center: the origin is the cameras' mean ("poses"), the point nearest to their optical axes ("focus"),
+            or the world's.
+        auto_scale: whether the farthest coordinate of a camera becomes 1.
+        factor: scale in addition.
+    """
+    origin = poses[:, :, 3].mean(axis=0)  # subtracted first, as the differences are small
+    turned = axes @ np.concatenate([poses[:, :, :3], (poses[:, :, 3] - origin)[..., None]], axis=2)
+    turn = _turn(turned, orientation)
+    middle = _focus(turned) if center == "focus" else np.zeros(3)
+    offsets = (turned[:, :, 3] - middle) @ turn.T
+    if center == "none":
+        offsets = poses[:, :, 3] @ (turn @ axes).T
+        shift = np.zeros(3)
+    else:
+        shift = -turn @ (axes @ origin + middle)
+    far = float(np.abs(offsets).max())
+    scale = factor / far if auto_scale and far > 0 and _apart(poses[:, :, 3], points) else factor
+    return Frame(np.column_stack([turn @ axes, shift]), scale)
+
+
+def lost_cameras(centers: Float[Array, "n 3"], points: Float[Array, "m 3"]) -> Bool[Array, " n"]:
+    """Return which cameras stand so far from the others and the points that their poses must be wrong."""
+    middle = np.median(centers, axis=0)
+    distances = np.linalg.norm(centers - middle, axis=1)
+    to_points = np.median(np.linalg.norm(points - middle, axis=1)) if len(points) else 0.0
+    extent = max(float(np.median(distances)), float(to_points))
+    lost = distances > _LOST * extent
+    few = len(centers) >= 4 and lost.sum() <= _MOST_LOST * len(centers)
+    return lost if few and extent > 0 else np.zeros_like(lost)
+
+
+def _apart(centers: Float[Array, "n 3"], points: Float[Array, "m 3"]) -> bool:
+    """Return whether cameras are far enough apart to scale the scene by their distance."""
+    distances = np.linalg.norm(points - centers.mean(axis=0), axis=1)
+    typical = np.median(distances) if len(distances) else 0.0
+    return bool(np.ptp(centers, axis=0).max() > 1e-6 * typical)
+
+
+def turned_to(direction: Float[Array, "3"], target: tuple[int, int, int]) -> Float64[Array, "3 3"]:
+    """Compute the smallest rotation that takes a direction to another; the identity for a zero vector."""
+    length = float(np.linalg.norm(direction))
+    if length < 1e-12:
+        return np.eye(3)
+    return Rotation.align_vectors([target], [direction / length])[0].as_matrix()
+
+
+def _turn(poses: Float[Array, "n 3 4"], orientation: Orientation) -> Float64[Array, "3 3"]:
+    """Compute the rotation that turns the scene upright."""
+    up, up_axis = poses[:, :, 1].mean(axis=0), (0, 0, 1)
+    if orientation == "up":
+        return turned_to(up, up_axis)
+    if orientation == "vertical":
+        _, sizes, axes = np.linalg.svd(poses[:, :, 0], full_matrices=True)
+        if len(poses) > 1 and sizes[1] > _PARALLEL * np.sqrt(len(poses)):
+            return turned_to(axes[2] * np.copysign(1.0, axes[2] @ up), up_axis)
+        return turned_to(up - axes[0] * (axes[0] @ up), up_axis)
+    if orientation == "pca":
+        axes = np.linalg.eigh(np.cov(poses[:, :, 3], rowvar=False, bias=True))[1].T[::-1].copy()
+        axes[2] *= np.sign(np.linalg.det(axes))
+        axes[1:] *= np.copysign(1.0, axes[2] @ up)
+        return axes
+    return np.eye(3)
+
+
+def _focus(poses: Float[Array, "n 3 4"]) -> Float64[Array, "3"]:
+    """Compute the point nearest to the optical axes; the cameras' mean if these are parallel."""
+    across = np.eye(3) - poses[:, :, 2, None] * poses[:, None, :, 2]
+    total = across.sum(axis=0)
+    if np.linalg.cond(total) > 1e8:
+        return poses[:, :, 3].mean(axis=0)
+    return np.linalg.solve(total, (across @ poses[:, :, 3, None]).sum(axis=0)[:, 0])

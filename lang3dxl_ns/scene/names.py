@@ -1,0 +1,109 @@
+"""Finding files by names that other programs wrote: with other folders, slashes, capitals or endings."""
+
+from __future__ import annotations
+
+import unicodedata
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import PurePosixPath
+
+from lang3dxl_ns.common.console import say, some
+from lang3dxl_ns.common.errors import UserError
+
+_Parts = tuple[str, ...]
+
+
+def normal_parts(name: str) -> _Parts:
+    """Split a name into folders and file name, in one form: slashes of Windows, drives, `.` and leading `..`
+    are removed, capitals are small, and letters with accents are one character."""
+    name = unicodedata.normalize("NFC", name.replace("\\", "/")).casefold()
+    parts: list[str] = []
+    for part in name.split("/"):
+        if part == ".." and parts:
+            parts.pop()
+        elif part not in ("", ".", "..") and not part.endswith(":"):
+            parts.append(part)
+    return tuple(parts)
+
+
+class NameFinder:
+    """Index of files, in which names of other programs are looked up.
+
+    A name finds the file of the same name, or else of the same name without its ending; among several, the
+    one whose folders agree with the name's the farthest up.
+    """
+
+    def __init__(self, files: Iterable[str]) -> None:
+        self._files = defaultdict[str, list[str]](list)
+        self._stems = defaultdict[str, list[str]](list)
+        for file in files:
+            last = normal_parts(file)[-1]
+            self._files[last].append(file)
+            self._stems[_stem(last)].append(file)
+
+    def find(self, name: str) -> list[str]:
+        """Return the files that fit a name best: one if it is found, several if it is ambiguous."""
+        parts = normal_parts(name)
+        if not parts:
+            return []
+        whole = self._files.get(parts[-1], [])
+        if whole:
+            return _deepest(parts[:-1], whole)
+        return _deepest(parts[:-1], self._stems.get(parts[-1], []) or self._stems.get(_stem(parts[-1]), []))
+
+
+def _stem(name: str) -> str:
+    return PurePosixPath(name).stem
+
+
+def _deepest(folders: _Parts, files: Sequence[str]) -> list[str]:
+    """Keep the files whose folders agree with these the farthest up. Of several, keep those of which all
+    folders do, if there are any."""
+    depths = {}
+    for file in files:
+        own = normal_parts(file)[:-1]
+        pairs = list(zip(reversed(own), reversed(folders), strict=False))
+        depth = next((i for i, (a, b) in enumerate(pairs) if a != b), len(pairs))
+        depths[file] = (depth, depth == len(own))
+    best = max(depths.values(), default=None)
+    return [file for file in files if depths[file] == best]
+
+
+def resolve(
+    names: Sequence[str], exists: Callable[[str], bool], list_files: Callable[[], Iterable[str]], what: str
+) -> tuple[dict[str, str], dict[str, UserError]]:
+    """Find the file of each name, and say how many have others than their names.
+
+    Args:
+        names: names as they were written, each once.
+        exists: whether a name is a file as it is. Such files are never given to another name.
+        list_files: lists all files, relative to the folder; called only if a name is not a file.
+        what: what the files are, for the message: "photos".
+
+    Returns:
+        the files by name, and the reasons for names that fit several files or share one. A name that fits
+        none is in neither.
+    """
+    found = {name: name for name in names if exists(name)}
+    others = [name for name in names if name not in found]
+    if not others:
+        return found, {}
+    taken = set(found.values())
+    finder, refused = NameFinder(file for file in list_files() if file not in taken), dict[str, UserError]()
+    guessed = dict[str, str]()
+    for name in others:
+        fitting = finder.find(name)
+        if fitting == [name]:
+            continue  # it is something else than a file
+        if len(fitting) == 1:
+            guessed[name] = fitting[0]
+        elif fitting:
+            refused[name] = UserError(f"it is not there, and fits {len(fitting)} files: {some(fitting, 3)}")
+    shared = {file for file, count in Counter(guessed.values()).items() if count > 1}
+    for name in [name for name, file in guessed.items() if file in shared]:
+        file = guessed.pop(name)
+        refused[name] = UserError(f"it is not there, and {file} fits other names as well")
+    if guessed:
+        name, file = next(iter(guessed.items()))
+        say(f"{len(guessed)} of {len(names)} {what} have other names than listed: {some([name])} is {file}")
+    return found | guessed, refused

@@ -1,0 +1,113 @@
+// What the page shows as an address, its steps in the browser's history (Undo, Redo, Back and Forward), and lists that
+// the browser keeps for a scene.
+
+const MOST_KEPT = 20, MOST_PROMPTS = 20;
+
+/** Write what is shown as fields of an address, in order: { view, walk, … } and prompts, each of them with the
+ * fields `at` (a threshold that was chosen) and `hue` (its color, where that is not the next one). */
+export function written({ prompts, ...others }) {
+  const fields = new URLSearchParams();
+  for (const [name, value] of Object.entries(others)) if (value) fields.set(name, value);
+  prompts.forEach(({ kind, text, at, hue }, k) => {
+    fields.append(kind, text);
+    if (at !== undefined) fields.append("at", +at.toFixed(3));
+    if (hue !== k) fields.append("hue", hue);
+  });
+  return `#${fields}`;
+}
+
+/** Read an address: the opposite of `written`. What is damaged or unknown is left out. */
+export function readFields(hash) {
+  const shown = { prompts: [] };
+  let latest = null;
+  for (const [name, value] of new URLSearchParams(hash.slice(1))) {
+    const number = value === "" ? NaN : Number(value);
+    if (name === "ask" || name === "like") shown.prompts.push((latest = { kind: name, text: value, hue: shown.prompts.length }));
+    else if (name === "at" && latest && number >= 0 && number <= 1) latest.at = number;
+    else if (name === "hue" && latest && Number.isInteger(number) && number >= 0) latest.hue = number;
+    else if (name !== "at" && name !== "hue" && name !== "prompts") shown[name] = value;
+  }
+  shown.prompts.splice(MOST_PROMPTS);
+  return shown;
+}
+
+/** Steps of this page in the browser's history. Each holds an address; the view in it follows the eye. */
+export class Steps {
+  /** apply: called with an address that Back, Forward, Undo, Redo or the user has chosen. */
+  constructor(apply, changed) {
+    this.changed = changed;
+    this.now = history.state?.step ?? 0;
+    this.last = this.now;
+    this.hash = location.hash;
+    addEventListener("popstate", ({ state }) => {
+      if (location.hash === this.hash) return;
+      this.hash = location.hash;
+      if (state?.step === undefined) this.last = this.now += 1; // an address that was typed
+      this.now = state?.step ?? this.now;
+      history.replaceState({ step: this.now }, "");
+      this.last = Math.max(this.last, this.now);
+      changed();
+      apply(this.hash);
+    });
+  }
+
+  /** Keep an address: as a step of its own if more than the view differs from before, or if asked for. */
+  keep(hash, own = false) {
+    if (own || without(hash) !== without(this.hash)) this.last = this.now += 1;
+    else if (hash === this.hash && history.state) return;
+    const moved = this.now > (history.state?.step ?? 0);
+    history[moved && history.state ? "pushState" : "replaceState"]({ step: this.now }, "", hash);
+    this.hash = hash;
+    this.changed();
+  }
+
+  /** Take over an address without a step: the one that the page opens with. */
+  begin(hash) {
+    history.replaceState({ step: this.now }, "", hash);
+    this.hash = hash;
+    this.changed();
+  }
+
+  get past() {
+    return this.now > 0;
+  }
+
+  get future() {
+    return this.now < this.last;
+  }
+
+  undo() {
+    if (this.past) history.back();
+  }
+
+  redo() {
+    if (this.future) history.forward();
+  }
+}
+
+function without(hash) {
+  const fields = new URLSearchParams(hash.slice(1));
+  fields.delete("view");
+  return String(fields);
+}
+
+/** A list kept in this browser for the scene: earlier "prompts" or named "words", latest first. */
+export class Kept {
+  constructor({ title, count, center }) {
+    this.scene = `${title} ${count} ${center}`;
+  }
+
+  list(kind) {
+    try {
+      return [JSON.parse(localStorage.getItem(`lang3dxl ${kind} ${this.scene}`))].flat().filter(Boolean);
+    } catch {
+      return []; // the browser keeps nothing
+    }
+  }
+
+  store(kind, list) {
+    try {
+      localStorage.setItem(`lang3dxl ${kind} ${this.scene}`, JSON.stringify(list.slice(0, MOST_KEPT)));
+    } catch {} // the browser keeps nothing
+  }
+}

@@ -1,0 +1,84 @@
+"""Words taught from a live page: its marks become the scene's, as `lang3dxl teach` would keep them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from threading import Lock
+from typing import Any
+
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.files import locked
+from lang3dxl_ns.files.scene_file import describe_scene_file, keep_words
+from lang3dxl_ns.query.scene import Scene
+from lang3dxl_ns.words.taught_words import Example, known_word
+
+
+@dataclass
+class PageWords:
+    """Words that the pages of one server teach."""
+
+    file: Path | None = None
+    """Scene file that keeps the words; None: they last as long as the server."""
+    _marked: dict[str, list[dict[str, Any]]] = field(default_factory=dict)
+    """Examples that pages sent, by word, in JSON."""
+    _one: Lock = field(default_factory=Lock)
+
+    def teach(self, scene: Scene, content: Mapping[str, Any]) -> tuple[Scene, str]:
+        """Teach a word from a page's marks; return the scene with it, and a sentence for the page.
+
+        Args:
+            scene: the scene as it is.
+            content: the word's `name`, the name that it had `before`, and all `examples` marked in pages, as
+                `Example.to_json` writes them. They replace what pages sent earlier; examples that were
+                taught otherwise stay. None forgets what pages taught.
+
+        Raises:
+            UserError: the content is not of this form, or see `Scene.teach`.
+        """
+        try:
+            name, before = str(content["name"]), str(content["before"])
+            examples = [Example.from_json(example) for example in content["examples"]]
+        except (ValueError, LookupError, TypeError, AttributeError) as error:
+            raise UserError(f"these are no marks of a word ({error}): load the page again") from error
+        with self._one:
+            if self.file is None:
+                return self._taught(scene, name, before, examples)
+            with locked(self.file.resolve().parent):  # another command that teaches comes first, or waits
+                known = {known_word(word.name): word for word in describe_scene_file(self.file)["taught"]}
+                scene, told = self._taught(scene.with_words(known.values()), name, before, examples)
+                changed = {word: scene.words.get(word) for word in {known_word(name), known_word(before)}}
+                keep_words(
+                    self.file, {word: new for word, new in changed.items() if new is not known.get(word)}
+                )
+        return scene, told
+
+    def _taught(self, scene: Scene, name: str, before: str, examples: Sequence[Example]) -> tuple[Scene, str]:
+        for former in {known_word(before), known_word(name)}:
+            scene = self._without_marks(scene, former)
+        key = known_word(name)
+        others = scene.words[key].examples if key in scene.words else ()
+        if not examples:
+            return scene, f"The scene forgot {name!r}."
+        scene = scene.teach(name, [*others, *examples])
+        word = scene.words[key]
+        self._marked[key] = [_plain(example) for example in word.examples[len(others) :]]
+        place = "It lasts until the server ends." if self.file is None else f"{self.file.name} keeps it."
+        return scene, f"Taught by {len(word.examples)} photo{'s' * (len(word.examples) > 1)}. {place}"
+
+    def _without_marks(self, scene: Scene, name: str) -> Scene:
+        """Return the scene without what pages marked for a word. Other examples stay."""
+        word, ours = scene.words.get(name), self._marked.pop(name, [])
+        if word is None or not ours:
+            return scene
+        left = [example for example in word.examples if _plain(example) not in ours]
+        rest = [other for other in scene.words.values() if other is not word]
+        if left:
+            return scene.with_words(rest).teach(word.name, left)
+        return scene.with_words(rest)
+
+
+def _plain(example: Example) -> dict[str, Any]:
+    """Return an example as it comes back from a file."""
+    return Example.from_json(example.to_json()).to_json()

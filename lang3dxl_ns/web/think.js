@@ -1,0 +1,21 @@
+// The page's worker: jobs that think about the scene beside its drawing.
+
+/** Start a worker; returns a function that gives it a job and resolves to the answer. told: called with the share of
+ * the scene that has been read; failed: called if the worker can't run. */
+export function thinker(told, failed) {
+  const worker = new Worker("worker.js", { type: "module" }), waiting = new Map();
+  worker.onmessage = ({ data: { id, output, error, done } }) => {
+    if (done !== undefined) return told(done);
+    const [resolve, reject] = waiting.get(id);
+    waiting.delete(id);
+    if (error) reject(new Error(error));
+    else resolve(output);
+  };
+  worker.onerror = failed;
+  return (job, input = {}) =>
+    new Promise((...settle) => {
+      const id = Math.random();
+      waiting.set(id, settle);
+      worker.postMessage({ id, job, input });
+    });
+}
