@@ -37,6 +37,7 @@ BENCHMARKS = {
     "lerf-ovs": ("lab.benchmarks.published:LerfOvs", "LERF-OVS, beside the published figures."),
     "pt-ovs": ("lab.benchmarks.published:PtOvs", "PT-OVS, scene by scene."),
     "teaching": ("lab.benchmarks.teaching:TeachingBenchmark", "Words taught by example, beside the text."),
+    "things": ("lab.benchmarks.things:ThingsBenchmark", "Single windows, portals, towers: F1, counts, boxes."),
     "attach": ("lab.benchmarks.attach:AttachBenchmark", "Words attached to a splat, beside its run's."),
 }
 COMMANDS = {
