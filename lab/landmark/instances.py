@@ -66,7 +66,9 @@ def true_things(landmark: Landmark) -> tuple[list[TrueThing], list[Array]]:
 
 def _solids(landmark: Landmark) -> Iterator[tuple[str, list[int]]]:
     """Yield part and shapes of every thing. A dome that was built of one bare shape is a thing too."""
-    free = {i for i, s in enumerate(landmark.shapes) if not isinstance(s, Openings) and PARTS[s.part] in WORDS}
+    free = {
+        i for i, s in enumerate(landmark.shapes) if not isinstance(s, Openings) and PARTS[s.part] in WORDS
+    }
     for part, shapes in landmark.things:
         own = [i for i in shapes if i in free and PARTS[landmark.shapes[i].part] == part]
         free -= set(own)
@@ -78,7 +80,11 @@ def _solids(landmark: Landmark) -> Iterator[tuple[str, list[int]]]:
 def _opening(shape: Openings, word: str, row: int, column: int) -> TrueThing:
     wide, tall = shape.field[0] / shape.columns, shape.field[1] / shape.rows
     sill = 0.0 if shape.rows == 1 else (tall - shape.height) / 2
-    local = (-shape.depth / 2, (column + 0.5) * wide - shape.field[0] / 2, row * tall + sill + shape.height / 2)
+    local = (
+        -shape.depth / 2,
+        (column + 0.5) * wide - shape.field[0] / 2,
+        row * tall + sill + shape.height / 2,
+    )
     center = np.array(shape.to_world(local)) + shape.position
     return TrueThing(word, center, _axes(shape.yaw), np.array([shape.depth, shape.width, shape.height]))
 
@@ -95,7 +101,9 @@ def _axes(yaw: float) -> Float[Array, "3 3"]:
     return np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
-def pixels(landmark: Landmark, numbers: list[Array], camera: Camera, size: tuple[int, int]) -> Int[Array, "h w"]:
+def pixels(
+    landmark: Landmark, numbers: list[Array], camera: Camera, size: tuple[int, int]
+) -> Int[Array, "h w"]:
     """Compute the number of the thing that each pixel shows, -1 for none, ignoring passers-by."""
     width, height = size
     depth, index = cast(landmark.shapes, camera, width, height)
@@ -105,7 +113,9 @@ def pixels(landmark: Landmark, numbers: list[Array], camera: Camera, size: tuple
         shape, where = landmark.shapes[i], index == i
         if isinstance(shape, Openings) and len(numbers[i]):
             t = depth[where]
-            at = [o + t * np.broadcast_to(d, index.shape)[where] for o, d in zip(origin, direction, strict=True)]
+            at = [
+                o + t * np.broadcast_to(d, index.shape)[where] for o, d in zip(origin, direction, strict=True)
+            ]
             _, y, z = shape.point_to_local((at[0], at[1], at[2]))
             column = ((y / shape.field[0] + 0.5) * shape.columns).astype(int).clip(0, shape.columns - 1)
             row = (z / shape.field[1] * shape.rows).astype(int).clip(0, shape.rows - 1)

@@ -30,7 +30,6 @@ def is_thing(build: Build) -> Build:
     return cast(Build, recorded)
 
 
-
 @dataclass
 class ShapeList:
     """Collection of shapes and their materials."""

@@ -104,7 +104,9 @@ def _sharpened(scene: Scene, relevancy: Float[Tensor, " n"]) -> Float[Tensor, " 
     weight = np.sqrt(mass[rows]) * len(rows) / 2
     weight[: len(match)] /= np.sqrt(mass[match]).sum()
     weight[len(match) :] /= np.sqrt(mass[around]).sum()
-    model = LogisticRegression(C=10).fit(colors[rows], np.arange(len(rows)) < len(match), sample_weight=weight)
+    model = LogisticRegression(C=10).fit(
+        colors[rows], np.arange(len(rows)) < len(match), sample_weight=weight
+    )
     return relevancy * torch.from_numpy(model.predict_proba(colors)[:, 1]).to(relevancy)
 
 
