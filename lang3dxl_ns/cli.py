@@ -1,4 +1,4 @@
-"""The `lang3dxl` command: all tasks except training and rendering, which have the ns-* commands."""
+"""The `lang3dxl` command: all tasks except rendering and training with a viewer, which ns-* commands do."""
 
 from __future__ import annotations
 
@@ -41,6 +41,7 @@ BENCHMARKS = {
 }
 COMMANDS = {
     "demo": ("lab.landmark.demo:Demo", "The full workflow in minutes, on a generated landmark."),
+    "train": ("commands.train:Train", "A scene from photos; a stopped run goes on."),
     "reconstruct": ("commands.prepare:Reconstruct", "COLMAP model from photos, or a video."),
     "prepare": ("commands.prepare:Prepare", "Make the targets that training learns from, in advance."),
     "attach": ("commands.attach:Attach", "Words for a splat that any program made: PLY, SPZ, checkpoints."),
@@ -81,7 +82,8 @@ def main(arguments: list[str] | None = None) -> None:
     except UserError as error:
         # Messages name the options of ns-train, which these two pass on; others have them without the prefix.
         prefix = "--" if words[0] in ("demo", "benchmark") else "--pipeline.datamanager."
-        sys.exit(f"Error: {str(error).replace(prefix, '--')}")
+        message = str(error).replace(prefix, "--")
+        sys.exit(f"Error: {message.replace('--pipeline.model.', '--') if words[0] == 'train' else message}")
     except ModuleNotFoundError as error:
         if not misses_nerfstudio(error):
             raise
@@ -104,7 +106,7 @@ def main(arguments: list[str] | None = None) -> None:
         sys.exit(130)
 
 
-_TEXTS = "Texts follow --text: lang3dxl {} RUN --text windows --out {}"
+_TEXTS = "Texts follow --text: lang3dxl {} RUN --text windows{}"
 
 
 def _parsed(words: Sequence[str]) -> Any:
@@ -115,7 +117,7 @@ def _parsed(words: Sequence[str]) -> Any:
         parsed = tyro.cli(choice, args=words, description=__doc__, config=(tyro.conf.OmitArgPrefixes,))
     except SystemExit as error:
         if error.code == 2 and words[0] in ("query", "export"):
-            print(_TEXTS.format(words[0], "found" if words[0] == "query" else "found.ply"), file=sys.stderr)
+            print(_TEXTS.format(words[0], "" if words[0] == "query" else " --out found.ply"), file=sys.stderr)
         raise
     # Shells leave the ~ of --out=~/found as it is.
     vars(parsed).update({name: expanded(v) for name, v in vars(parsed).items() if isinstance(v, Path)})
