@@ -42,7 +42,7 @@ def bytes_of(run: Training, pixels: int) -> tuple[float, float]:
     codes = run.gaussians["codes"] if run.learns_from_renderings and "codes" in run.gaussians else None
     of_codes = 0.0 if codes is None else PER_CODE * codes.shape[1]
     # Of two threads, `PER_GAUSSIAN` has the sums.
-    many = run.gaussians["means"].device.type == "cpu" and torch.get_num_threads() > 2
+    many = not on_gpu and torch.get_num_threads() > 2
     fixed = PER_PARAMETER * others + max(PER_PIXEL * pixels, words) + many * MOST_SUMS
     others_each = PER_GAUSSIAN_ON_GPU if on_gpu else PER_GAUSSIAN
     looks = 0.0 if run.parts.appearance is None else PER_LOOK
