@@ -37,6 +37,8 @@ BENCHMARKS = {
     "lerf-ovs": ("lab.benchmarks.published:LerfOvs", "LERF-OVS, beside the published figures."),
     "pt-ovs": ("lab.benchmarks.published:PtOvs", "PT-OVS, scene by scene."),
     "teaching": ("lab.benchmarks.teaching:TeachingBenchmark", "Words taught by example, beside the text."),
+    "trust": ("lab.benchmarks.trust:TrustBenchmark", "Cautions under wrong answers, and under right ones."),
+    "things": ("lab.benchmarks.things:ThingsBenchmark", "Single windows and towers: F1, counts, boxes."),
     "attach": ("lab.benchmarks.attach:AttachBenchmark", "Words attached to a splat, beside its run's."),
 }
 COMMANDS = {
@@ -48,6 +50,10 @@ COMMANDS = {
     "doctor": ("commands.doctor:Doctor", "Check this machine, with remedies."),
     "needs": ("commands.prepare:Needs", "Which optional components a scene needs, and why."),
     "query": ("commands.query:Query", "Search a trained scene for texts: heat maps, masks, relevancy maps."),
+    "things": (
+        "commands.things:ListThings",
+        "List, count and ask for single things: windows, portals, towers.",
+    ),
     "export": ("commands.query:Export", "Write a scene, or what matches a text, as a splat or a web page."),
     "teach": ("commands.teach:Teach", "Show a scene what a word means, by marking it in a photo."),
     "words": ("commands.teach:Words", "List, forget, save and load the words that a scene was taught."),
@@ -106,7 +112,7 @@ def main(arguments: list[str] | None = None) -> None:
         sys.exit(130)
 
 
-_TEXTS = "Texts follow --text: lang3dxl {} RUN --text windows --out {}"
+_TEXTS = "Texts follow --text: lang3dxl {} RUN --text windows{}"
 
 
 def _parsed(words: Sequence[str]) -> Any:
@@ -117,7 +123,7 @@ def _parsed(words: Sequence[str]) -> Any:
         parsed = tyro.cli(choice, args=words, description=__doc__, config=(tyro.conf.OmitArgPrefixes,))
     except SystemExit as error:
         if error.code == 2 and words[0] in ("query", "export"):
-            print(_TEXTS.format(words[0], "found" if words[0] == "query" else "found.ply"), file=sys.stderr)
+            print(_TEXTS.format(words[0], "" if words[0] == "query" else " --out found.ply"), file=sys.stderr)
         raise
     # Shells leave the ~ of --out=~/found as it is.
     vars(parsed).update({name: expanded(v) for name, v in vars(parsed).items() if isinstance(v, Path)})

@@ -124,6 +124,9 @@ def attach(
         made = f"attached to {path.name} from {len(collection.photos)} {what}"
         scene, written = replace_scene(place, scene, Provenance(title=place.stem, made_how=made))
         say(f"Wrote {written / 1e6:.1f} MB to {place}")
+        if data is None:
+            kept = sum(file.stat().st_size for file in collection.folder.rglob("*") if file.is_file())
+            say(f"{collection.folder} keeps the views ({kept / 1e6:.0f} MB): delete it if you are done")
     return scene
 
 

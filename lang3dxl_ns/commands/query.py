@@ -62,7 +62,7 @@ class Query:
     """Text to search for, such as '"windows" not "arcades"'. Repeat the flag, or separate texts with `;`."""
     not_: _Not = field(default_factory=list)
     """Negative for all texts, such as arcades. Repeat the flag for more."""
-    out: Path
+    out: Path = Path("found")
     """Folder for the results."""
     image: str | None = None
     """Use the view of this photo, by name."""

@@ -114,15 +114,15 @@ class Lang3DXLDataManager(FullImageDatamanager):
         self._gone = 0
         if config.data is not None:
             config.dataparser.data = Path(config.data)
-        # never find a run's own cameras anew: its Gaussians would not match them
-        config.dataparser = parser_for(config.dataparser, config.cache_dir, config.run is None)
-        if isinstance(config.dataparser, PhotoCollectionDataParserConfig):
-            config.data = config.dataparser.data
-        if hasattr(config.dataparser, "load_3D_points"):
-            config.dataparser.load_3D_points = True  # off by default in some of nerfstudio's
         opens = kwargs.get("test_mode", "val") != "val"
         recorded = recorded_scene(config.run) if opens else None
         try:
+            # never find a run's own cameras anew: its Gaussians would not match them
+            config.dataparser = parser_for(config.dataparser, config.cache_dir, config.run is None)
+            if isinstance(config.dataparser, PhotoCollectionDataParserConfig):
+                config.data = config.dataparser.data
+            elif hasattr(config.dataparser, "load_3D_points"):
+                config.dataparser.load_3D_points = True  # off by default in some of nerfstudio's
             super().__init__(config, *args, **kwargs)
             if recorded is not None:
                 self._check_recorded(SceneRecord.read(recorded.run / SCENE_FILE))

@@ -101,7 +101,7 @@ def meaning(text: str) -> Meaning:
     target = article.sub("", target)
     where = re.compile(
         rf"\s+(?:{_any('before_places')})\s+(?:the\s+)?(?:{_any('places')})(?!\w).*$"
-        rf"|^(?:{_any('places')}|{_any('sizes')})\s+(?!of\b)(?=\S)|\s+(?:{_any('places')})$",
+        rf"|^(?:{_any('places')}|{_any('sizes')})\s+(?!of\b)(?=\S)|\s+(?:{_any('after')})$",
         re.IGNORECASE,
     )
     if parts := [found[0].strip() for found in where.finditer(target)]:

@@ -19,6 +19,7 @@ from torch import Tensor
 from lang3dxl_ns.query.doubt import doubtful
 from lang3dxl_ns.query.engine import QueryEngine
 from lang3dxl_ns.query.vocabulary import same_thing
+from lang3dxl_ns.scene.record import same_clip
 
 Level = Literal["sure", "uncertain", "doubtful"]
 ANCHORS = ("window", "door", "tower", "spire", "dome", "roof", "wall", "arch", "column")
@@ -29,8 +30,9 @@ FAINT = 0.5
 """Peaks below this are doubtful: a negative fits better than the prompt even at its best places."""
 CLEARLY = 0.8
 """Peaks from which a prompt is found: 27 of 27 right words reach it on the validation landmarks."""
-CLEARLY_FAR = 0.9
-"""The same in a scene unlike what the CLIP was trained on."""
+STRICTER, STRICTEST = 0.15, 0.99
+"""How much more a scene unlike what the CLIP was trained on has to reach, per unit of foreignness beyond 1,
+and the most that is asked for."""
 FAR = 1.4
 """Foreignness from which a scene is unlike what the CLIP was trained on. Six validation landmarks have
 0.9 to 1.2, the castle 2.0."""
@@ -90,12 +92,20 @@ def judged(
     best = f"the best places for {text!r} fit at {peak:.2f}"
     if peak < FAINT:
         return Trust("doubtful", f"{best}, and other words fit better there: it may not be here", remedy)
-    world = f"; this scene is {foreign:.1f} times as far from what its CLIP was trained on as usual"
-    if peak < (CLEARLY_FAR if far else CLEARLY):
-        return Trust("uncertain", f"{best}, where right words reach 1.00{world if far else ''}", remedy)
+    usual = "times as far from what its CLIP was trained on as usual"
+    world = f"; this scene is {foreign:.1f} {usual}" if far else ""
+    if peak < least_peak(foreign):
+        return Trust("uncertain", f"{best}, where right words reach 1.00{world}", remedy)
     if alike:
         return Trust("uncertain", f"{text!r} selects the same as {' and '.join(alike)}", remedy, tuple(alike))
-    return Trust("sure", f"{best}{world if far else ''}")
+    return Trust("sure", f"{best}{world}")
+
+
+def least_peak(foreign: float | None) -> float:
+    """Compute the peak from which an answer is sure, by the foreignness of the scene."""
+    if foreign is None or foreign < FAR:
+        return CLEARLY
+    return min(CLEARLY + STRICTER * (foreign - 1), STRICTEST)
 
 
 def alike(
@@ -132,6 +142,6 @@ def known_world(clip_identity: str | None) -> tuple[Float[Tensor, " c"], Float[T
     from safetensors import safe_open
 
     with safe_open(KNOWN_WORLD, "pt") as file:
-        if file.metadata()["clip"] != clip_identity:
+        if not same_clip(file.metadata()["clip"], clip_identity):
             return None
         return file.get_tensor("mean"), file.get_tensor("precision")

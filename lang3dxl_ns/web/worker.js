@@ -20,7 +20,7 @@ async function understood(phrases) {
 /** Compute the verdict about a prompt whose phrases are known. */
 function judged([text, ...negatives], threshold) {
   const relevancy = answers.relevancy(text, negatives.map(({ own }) => own));
-  return answers.verdict(relevancy, { strict: Boolean(negatives.length || text.taught), doubt: text.taught?.doubt, threshold });
+  return answers.verdict(relevancy, { strict: Boolean(negatives.length || text.taught), doubt: text.taught?.doubt, threshold, name: text.name });
 }
 
 /** Compute which Gaussians may match: 1 where any of these prompts does; null without prompts. */

@@ -21,14 +21,17 @@ from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import make_folder, replace_file
 from lang3dxl_ns.common.pictures import PHOTO_SUFFIXES
 from lang3dxl_ns.files.scene_file import Provenance
+from lang3dxl_ns.query import view_ranking
 from lang3dxl_ns.query.doubt import BEST, DOUBTFUL, DOUBTFUL_TAUGHT, LEAST_PEAK
 from lang3dxl_ns.query.heat_maps import PROMPT_COLORS
+from lang3dxl_ns.query.language import TABLE
 from lang3dxl_ns.query.negatives import CLEAR, NOTHING, competitors
 from lang3dxl_ns.query.scene import NO_SEMANTICS, Scene
 from lang3dxl_ns.query.text import Prompt, tidy
 from lang3dxl_ns.query.thresholds import EVEN, SHARE
+from lang3dxl_ns.query.trust import ALIKE, ANCHORS, CLEARLY, FAINT, FAR, STRICTER, STRICTEST
 from lang3dxl_ns.query.visibility import spread
-from lang3dxl_ns.query.vocabulary import common_words, shipped_vocabulary
+from lang3dxl_ns.query.vocabulary import common_words, same_thing, shipped_vocabulary
 from lang3dxl_ns.web.pack import (
     LEAST_PIXELS,
     PIXEL_STEPS,
@@ -52,9 +55,11 @@ _MOST_BYTES = 8_000_000
 """Most bytes of the views that the page flies to, and of the lightings; evenly spaced ones are kept."""
 _RULES = {
     **{"best": BEST, "doubtful": DOUBTFUL, "doubtful_taught": DOUBTFUL_TAUGHT, "least_peak": LEAST_PEAK},
-    **{"even": EVEN, "share": SHARE, "clear": CLEAR},
+    **{"even": EVEN, "share": SHARE, "clear": CLEAR, "alike": ALIKE, "faint": FAINT},
+    **{"clearly": CLEARLY, "stricter": STRICTER, "strictest": STRICTEST, "far": FAR},
 }
 """Numbers that decide what matches, what is doubtful and what a place is called, for the page's answers."""
+_RANKING = ("PEAK", "LARGE", "RIM", "STRONG", "CORE", "JOINED", "OUTLIERS", "DENSE")
 _TEXTS = 256
 """Number of texts encoded at a time."""
 _DATA = re.compile(
@@ -111,6 +116,7 @@ class Page:
         means = scene.splats.means[scene.splats.sound()]
         center = means.median(0).values if len(means) else self._toward
         files = {path.name: path.read_bytes() for path in _FILES}
+        files["language.js"] = language_module()
         files["splats.bin"] = pack_splats(scene.baked(self.look), center, self._toward).tobytes()
         up = np.mean([photo.pose[:3, 1] for photo in scene.photos], axis=0)
         told = self.provenance
@@ -145,6 +151,7 @@ class Page:
                 "gap": scene.gap,
                 "covered": scene.config.min_alpha,
                 "rules": _RULES,
+                "foreign": scene.foreignness,
                 "pixels": [LEAST_PIXELS, PIXEL_STEPS],
             }
             files |= self._meaning.files | self._vocabulary(self._meaning)
@@ -190,7 +197,7 @@ class Page:
         negatives, taught = list(self.scene.text.config.negatives), self.scene.words
         asked = [phrase for phrases in _phrases([*self.prompts, *self._foreground]) for phrase in phrases]
         naming = _distinct([*shipped_vocabulary(), *self.words, *asked])
-        others = [*(word.name for word in taught.values()), *common_words(), *self.more]
+        others = [*(word.name for word in taught.values()), *common_words(), *ANCHORS, *self.more]
         words = _distinct([*naming, *others])
         numbers = [*self._encoded(meaning, negatives), *self._encoded(meaning, words)]
         count = len(negatives) + len(words)
@@ -212,6 +219,9 @@ class Page:
         described = {"negatives": negatives, "words": words, "naming": len(naming), "special": special}
         described["nothing"] = [i for i, phrase in enumerate(negatives) if phrase in NOTHING]
         described["taught"] = learned
+        described["anchors"] = {
+            anchor: [known_word(word) for word in words if same_thing(anchor, [word])] for anchor in ANCHORS
+        }
         listed = json.dumps(described).encode()
         return {"vocabulary.json": listed, "vocabulary.bin": halves(torch.cat(numbers))}
 
@@ -267,6 +277,13 @@ class Page:
         return pack_colors(self.scene.baked(photo), self._toward).tobytes()
 
 
+def language_module() -> bytes:
+    """Write the table of what people type, and the numbers by which views are ranked, as a module."""
+    table = {name: value for name, value in TABLE.items() if name != "cases"}
+    table["ranking"] = {name: getattr(view_ranking, name) for name in _RANKING}
+    return f"export default {json.dumps(table, ensure_ascii=False)};\n".encode()
+
+
 def _phrases(prompts: Sequence[Prompt]) -> list[list[str]]:
     """List each prompt's text with its negatives."""
     return [[prompt.text, *prompt.negatives] for prompt in prompts]
@@ -281,7 +298,10 @@ def write_page(page: Page, folder: Path) -> int:
     """Write a page's files into a folder for any static web server; return the number of bytes. Raises
     UserError for a folder that has files of these names, or pictures, and is not such a page."""
     make_folder(folder)
-    index, names = folder / _INDEX.name, {*(path.name for path in _FILES), "scene.json", "vocabulary.json"}
+    index, names = (
+        folder / _INDEX.name,
+        {*(path.name for path in _FILES), "scene.json", "vocabulary.json", "language.js"},
+    )
     ours = index.is_file() and "<title>A scene to ask</title>" in index.read_text(errors="replace")
     other = (".bin", *PHOTO_SUFFIXES)  # whoever serves a folder of photos would publish them
     here = sorted(folder.iterdir())

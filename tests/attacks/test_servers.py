@@ -147,6 +147,14 @@ def test_this_machine_alone_needs_no_token(host):
     assert not access.needs_token and access.address.endswith(":7007/")
 
 
+def test_a_server_at_all_addresses_names_one_for_other_machines():
+    access = Access("0.0.0.0", 7007)
+    assert "localhost" in access.address and access.elsewhere is not None
+    assert urllib.parse.urlsplit(access.elsewhere).hostname not in ("0.0.0.0", "localhost", "127.0.0.1")
+    assert access.elsewhere.endswith(f":7007/?token={access.token}")
+    assert Access("192.168.1.5", 7007).elsewhere is None
+
+
 @pytest.mark.parametrize("host", ["0.0.0.0", "", "::", "192.168.1.5", "my-machine", "128.0.0.1"])
 def test_a_host_open_to_others_needs_a_token(host):
     assert Access(host, 7007).needs_token
