@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from contextlib import nullcontext
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 import viser
@@ -210,7 +210,13 @@ def stand_of(
     return position, position + max(ahead, 0.05) * forward, fov
 
 
-def _changes(trainer: Any) -> bool:
+class _Trains(Protocol):
+    """What tells whether a trainer still changes its model."""
+
+    training_state: str
+
+
+def _changes(trainer: _Trains | None) -> bool:
     """Return whether training still changes its model; None: there is no training."""
     if trainer is None or trainer.training_state == "completed":
         return False
