@@ -18,7 +18,7 @@ from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth
 from lang3dxl_ns.preparation.model_files import option_prefix, short_options, spoken
 from lang3dxl_ns.query.match import together
-from lang3dxl_ns.query.text import Prompt, caution, parse_prompts
+from lang3dxl_ns.query.text import Prompt, parse_prompts
 
 
 def report(path: Path, scene: str, layout: str = "plain", scored: bool = True) -> None:
@@ -176,18 +176,6 @@ def test_python_calls_with_anything_else_name_what_was_expected(value):
     assert scene.ask("dome", negatives="door").prompts[0].negatives == ("door",)
     assert len(scene.encode([])) == 0
     assert len(scene.encode("dome\ud800")) == len(scene.encode("dome"))
-
-
-@pytest.mark.parametrize("typed", ["rose window not door", "‘window’ not door", "a NOT 'b'"])
-def test_a_not_without_quotes_is_told_of_with_the_answer_not_by_parsing(typed, capsys):
-    (prompt,) = parse_prompts(typed)
-    assert prompt.negatives == () and "not" in prompt.text.lower()
-    assert "To tell one thing from another" in caution(prompt.text)
-    assert caution("knot pattern") is None and "to tell" not in (caution("nothing") or "")
-    assert parse_prompts("‘window’ not ‘door’")[0].negatives == ("door",)
-    assert parse_prompts('"window" not "door"')[0].negatives == ("door",)
-    assert parse_prompts("the king’s door")[0].text == "the king’s door"
-    assert not capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
