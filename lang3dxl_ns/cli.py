@@ -1,4 +1,4 @@
-"""The `lang3dxl` command: all tasks except training and rendering, which have the ns-* commands."""
+"""The `lang3dxl` command: all tasks except rendering and training with a viewer, which ns-* commands do."""
 
 from __future__ import annotations
 
@@ -37,17 +37,29 @@ BENCHMARKS = {
     "lerf-ovs": ("lab.benchmarks.published:LerfOvs", "LERF-OVS, beside the published figures."),
     "pt-ovs": ("lab.benchmarks.published:PtOvs", "PT-OVS, scene by scene."),
     "teaching": ("lab.benchmarks.teaching:TeachingBenchmark", "Words taught by example, beside the text."),
+<<<<<<< HEAD
     "trust": ("lab.benchmarks.trust:TrustBenchmark", "Cautions under wrong answers, and under right ones."),
+=======
+    "things": (
+        "lab.benchmarks.things:ThingsBenchmark",
+        "Single windows, portals, towers: F1, counts, boxes.",
+    ),
+>>>>>>> things
     "attach": ("lab.benchmarks.attach:AttachBenchmark", "Words attached to a splat, beside its run's."),
 }
 COMMANDS = {
     "demo": ("lab.landmark.demo:Demo", "The full workflow in minutes, on a generated landmark."),
+    "train": ("commands.train:Train", "A scene from photos; a stopped run goes on."),
     "reconstruct": ("commands.prepare:Reconstruct", "COLMAP model from photos, or a video."),
     "prepare": ("commands.prepare:Prepare", "Make the targets that training learns from, in advance."),
     "attach": ("commands.attach:Attach", "Words for a splat that any program made: PLY, SPZ, checkpoints."),
     "doctor": ("commands.doctor:Doctor", "Check this machine, with remedies."),
     "needs": ("commands.prepare:Needs", "Which optional components a scene needs, and why."),
     "query": ("commands.query:Query", "Search a trained scene for texts: heat maps, masks, relevancy maps."),
+    "things": (
+        "commands.things:ListThings",
+        "List, count and ask for single things: windows, portals, towers.",
+    ),
     "export": ("commands.query:Export", "Write a scene, or what matches a text, as a splat or a web page."),
     "teach": ("commands.teach:Teach", "Show a scene what a word means, by marking it in a photo."),
     "words": ("commands.teach:Words", "List, forget, save and load the words that a scene was taught."),
@@ -82,7 +94,8 @@ def main(arguments: list[str] | None = None) -> None:
     except UserError as error:
         # Messages name the options of ns-train, which these two pass on; others have them without the prefix.
         prefix = "--" if words[0] in ("demo", "benchmark") else "--pipeline.datamanager."
-        sys.exit(f"Error: {str(error).replace(prefix, '--')}")
+        message = str(error).replace(prefix, "--")
+        sys.exit(f"Error: {message.replace('--pipeline.model.', '--') if words[0] == 'train' else message}")
     except ModuleNotFoundError as error:
         if not misses_nerfstudio(error):
             raise
@@ -105,7 +118,7 @@ def main(arguments: list[str] | None = None) -> None:
         sys.exit(130)
 
 
-_TEXTS = "Texts follow --text: lang3dxl {} RUN --text windows --out {}"
+_TEXTS = "Texts follow --text: lang3dxl {} RUN --text windows{}"
 
 
 def _parsed(words: Sequence[str]) -> Any:
@@ -116,7 +129,7 @@ def _parsed(words: Sequence[str]) -> Any:
         parsed = tyro.cli(choice, args=words, description=__doc__, config=(tyro.conf.OmitArgPrefixes,))
     except SystemExit as error:
         if error.code == 2 and words[0] in ("query", "export"):
-            print(_TEXTS.format(words[0], "found" if words[0] == "query" else "found.ply"), file=sys.stderr)
+            print(_TEXTS.format(words[0], "" if words[0] == "query" else " --out found.ply"), file=sys.stderr)
         raise
     # Shells leave the ~ of --out=~/found as it is.
     vars(parsed).update({name: expanded(v) for name, v in vars(parsed).items() if isinstance(v, Path)})

@@ -38,7 +38,7 @@ ORDER = (
     {"scene"},
     {"components", "rendering"},
     {"preparation"},
-    {"query", "words", "files", "web", "evaluation"},
+    {"query", "words", "files", "web", "evaluation", "things"},
     {"training"},
     {"attachment"},
     {"plugin"},

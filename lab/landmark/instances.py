@@ -1,4 +1,4 @@
-"""True things of a landmark: each window, portal, dome, tower, spire and minaret, and which photos show it."""
+"""True things of a landmark, such as its windows, portals and towers, and the photos that show each."""
 
 from __future__ import annotations
 

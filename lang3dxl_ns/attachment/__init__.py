@@ -41,10 +41,10 @@ class AttachConfig(PreparationConfig):
 def direction_of(name: str) -> tuple[float, ...]:
     """Return the unit direction that an axis (x, -x, y …) or three numbers "x,y,z" name. Raises UserError for
     other texts."""
-    numbers = tuple((-1.0 if name.startswith("-") else 1.0) * (axis == name[-1:]) for axis in "xyz")
-    if name.removeprefix("-") not in ("x", "y", "z"):
-        with suppress(ValueError):
-            numbers = tuple(float(number) for number in name.split(","))
+    sign, letter = -1.0 if name.startswith("-") else 1.0, name.removeprefix("-")
+    numbers = tuple(sign * (axis == letter) for axis in "xyz")
+    with suppress(ValueError):
+        numbers = numbers if any(numbers) else tuple(float(number) for number in name.split(","))
     length = hypot(*numbers)
     if len(numbers) != 3 or not 0 < length < inf:
         raise UserError(f"--up is {name}: give x, -x, y, -y, z, -z, or three numbers such as --up=0,-1,0.2")

@@ -20,7 +20,7 @@ from lang3dxl_ns.attachment import direction_of
 from lang3dxl_ns.attachment.upright import BACKGROUND, CERTAIN, find_up, name_of_axis
 from lang3dxl_ns.common.console import say, tracked
 from lang3dxl_ns.common.errors import DAMAGE, UserError
-from lang3dxl_ns.common.files import make_folder, read_json, write_atomically
+from lang3dxl_ns.common.files import make_folder, read_json, replace_file
 from lang3dxl_ns.query.match import as_bytes, save_picture
 from lang3dxl_ns.query.visibility import fingerprint
 from lang3dxl_ns.rendering import Rendering, Splats, composite, render
@@ -132,7 +132,7 @@ def rendered_views(splats: Splats, count: int, up: str, folder: Path) -> Capture
             save_picture(as_bytes(view.rgb), path)
         seen[name] = _tracked(name, view, chosen)
     content = {"of": stamp, "views": [camera.view_matrix.tolist() for camera in cameras]}
-    write_atomically(folder / "views.json", json.dumps(content))
+    replace_file(folder / "views.json", json.dumps(content))
     photos = [Photo(name, folder / "images" / name, None, LENS) for name in names]
     points = np.concatenate([photo.points for photo in seen.values()])
     reconstruction = Reconstruction(seen, points, np.zeros(points.shape, np.uint8))

@@ -16,9 +16,10 @@ from numpy import ndarray as Array
 from PIL import Image
 from scipy.ndimage import find_objects, label
 
+from lang3dxl_ns.common.checks import expect
 from lang3dxl_ns.common.console import say, some, tracked
-from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.common.files import make_folder, read_names, slugs, write_atomically
+from lang3dxl_ns.common.errors import UserError, readable
+from lang3dxl_ns.common.files import make_folder, read_json, read_names, replace_file, slugs, write_atomically
 from lang3dxl_ns.common.settings_help import showing
 from lang3dxl_ns.files.scene_file import Provenance, check_scene_name, replace_scene
 from lang3dxl_ns.files.splat_file import check_splat_name
@@ -61,7 +62,7 @@ class Query:
     """Text to search for, such as '"windows" not "arcades"'. Repeat the flag, or separate texts with `;`."""
     not_: _Not = field(default_factory=list)
     """Negative for all texts, such as arcades. Repeat the flag for more."""
-    out: Path
+    out: Path = Path("found")
     """Folder for the results."""
     image: str | None = None
     """Use the view of this photo, by name."""
@@ -82,6 +83,9 @@ class Query:
             raise UserError("--coco labels all photos: give --all too")
         if self.coco is not None and (self.coco.suffix != ".json" or self.coco.is_dir()):
             raise UserError(f"--coco writes labels as JSON: {self.coco} is not the name of a .json file")
+        if self.coco is not None and self.coco.is_file() and self.coco.stat().st_size:
+            with readable(f"{self.coco} is another file than one of labels", "choose another name"):
+                expect({"images", "annotations"} <= {*read_json(self.coco, 1 << 31)}, "it has no annotations")
         if sum((self.image is not None, self.all, self.camera_path is not None)) > 1:
             raise UserError("--image, --all and --camera-path exclude each other: give one of them")
         prompts = parse_texts(self.text, self.not_)  # fail now rather than after the work
@@ -122,7 +126,7 @@ class Query:
         texts = list(zip(prompts, question.trusts, question.thresholds, folders, strict=True))
         reports = zip(question.doubts, texts, strict=True)
         report = {"texts": [_text_report(scene, d, *text) for d, text in reports], "views": views}
-        write_atomically(listed, json.dumps(report, indent=2, ensure_ascii=False) + "\n")
+        replace_file(listed, json.dumps(report, indent=2, ensure_ascii=False) + "\n")
         for (prompt, trust, _, folder), (matches_there, score, where) in zip(texts, best, strict=True):
             taught = prompt.taught is not None
             closest = "" if matches_there else " (no match; this view comes closest)"

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from copy import deepcopy
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -36,6 +34,7 @@ from lang3dxl_ns.rendering import Rendering, Splats, composite
 from lang3dxl_ns.rendering.rasterize import Backend
 from lang3dxl_ns.scene.record import SceneRecord
 from lang3dxl_ns.training.parts import CameraRefinement
+from lang3dxl_ns.training.snapshot import snapshot
 from lang3dxl_ns.training.state import Training
 from lang3dxl_ns.training.step import render
 
@@ -137,20 +136,7 @@ class RenderingModel(SplatfactoModel):
         """Copy the present state to a separate scene, which later training doesn't change, with the photos,
         cameras and CLIP of a file; for the other arguments see `Scene`. While a model has no words yet, its
         scene has colors only."""
-        codes, looks = self.carried, self.appearance
-        return Scene(
-            self.splats().mapped(torch.clone),
-            file,
-            None if codes is None else _frozen(self.semantic_field),
-            None if codes is None else codes.detach().clone(),
-            looks=None if looks is None else _frozen(looks),
-            background=self._get_background_color().clone(),
-            config=config or QueryConfig(),
-            encode_texts=encode_texts,
-            cache=cache,
-            backend=self.backend,
-            watch=watch,
-        )
+        return snapshot(self.run, file, config=config, encode_texts=encode_texts, cache=cache, watch=watch)
 
     # ── looking ─────────────────────────────────────────────────────────────────────────────────────
 
@@ -253,8 +239,3 @@ class ViewersCameras(CameraOptimizer):
     def forward(self, indices: Tensor) -> Tensor:
         """Return the motions of some training cameras."""
         return super().forward(indices) if self._motions is None else self._motions(indices)
-
-
-def _frozen(module: Any) -> Any:
-    """Copy a module without gradients, for evaluation."""
-    return deepcopy(module).eval().requires_grad_(False)

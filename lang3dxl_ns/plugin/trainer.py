@@ -28,7 +28,7 @@ from torch.cuda.amp.grad_scaler import GradScaler
 
 from lang3dxl_ns.common.console import say, some
 from lang3dxl_ns.common.device import multiplies_bfloat16
-from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.errors import UserError, not_of_memory
 from lang3dxl_ns.common.files import expanded, replace_durably
 from lang3dxl_ns.common.memory import ran_out_of_memory
 from lang3dxl_ns.common.reports import synchronize
@@ -202,6 +202,7 @@ class Lang3DXLTrainer(Trainer):
                 self.grad_scaler.load_state_dict(state["scalers"])
             self._run_state, self.words_are_learned = state["run"], state["words"]
         except NOT_A_CHECKPOINT as error:
+            not_of_memory(error)
             raise UserError(
                 f"{path} is not a checkpoint of lang3dxl ({error}): give --load-dir the "
                 "nerfstudio_models folder of a run, or --load-checkpoint one of its step-….ckpt files"
@@ -263,6 +264,11 @@ class Lang3DXLTrainer(Trainer):
         words = self.words_are_learned or not self.pipeline.has_words_to_learn
         beyond = self._start_step - self.config.max_num_iterations
         return beyond > 0 or (beyond == 0 and words)
+
+    @property
+    def has_final_words(self) -> bool:
+        """Whether the words of the run's end are learned: from then on the model stays as it is."""
+        return self._is_ending and self.words_are_learned
 
     def train(self) -> None:
         """Train up to `max_num_iterations` in total (nerfstudio would add that many to a resumed run), then

@@ -128,8 +128,8 @@ class Match:
 def together(matches: Sequence[Match]) -> UInt8[Array, "h+legend w 3"]:
     """Draw several prompts in one view, each in its own color, the strongest where they overlap, with a
     legend below. Raises UserError if there is no match, or the matches are of different views."""
-    places = {(match.view.pixels.shape, str(match.view.camera.view_matrix.tolist())) for match in matches}
-    if len(places) != 1:
+    first = matches[0].view.camera if matches else None
+    if first is None or not all(match.view.camera.same_as(first) for match in matches):
         raise UserError("one picture shows the prompts of one view: pass the matches of a single query")
     maps = torch.stack([torch.from_numpy(match.relevancy) for match in matches])
     masks = torch.stack([torch.from_numpy(match.mask) for match in matches])

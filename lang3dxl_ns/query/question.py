@@ -52,8 +52,8 @@ class QueryConfig:
     min_alpha: float = 0.3
     """Coverage below which a pixel cannot match."""
     foreground: str = ""
-    """Restrict matches in views without a mask to what this prompt finds, such as `building`. The view of a
-    photo with a foreground mask is always restricted to that mask."""
+    """Restrict matches to what this prompt finds, such as `building`. The view of a photo with a foreground
+    mask is restricted to that mask as well."""
     size: int | None = None
     """Longer side of pictures in pixels. Default: the photo's own, at most 1920."""
     views: int = 100

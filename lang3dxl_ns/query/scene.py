@@ -40,7 +40,7 @@ from lang3dxl_ns.query.vocabulary import closest_word, common_words, searched, s
 from lang3dxl_ns.rendering import Backend, Rendering, Splats, composite
 from lang3dxl_ns.rendering.gathering import filled_pixels
 from lang3dxl_ns.scene.camera import Camera, posed, resized, with_field_of_view, with_longer_side
-from lang3dxl_ns.scene.record import ScenePhoto, SceneRecord, overview
+from lang3dxl_ns.scene.record import ScenePhoto, SceneRecord, overview, same_clip
 from lang3dxl_ns.words.taught_words import Example, TaughtWord, known_word
 from lang3dxl_ns.words.teach import carried_word, learned_word, least_certain_photo
 
@@ -603,7 +603,7 @@ def text_encoder(file: SceneRecord, device: torch.device | str) -> EncodeTexts:
     if file.clip is None:
         raise UserError(NO_SEMANTICS)
     encoder = load_image_text_encoder(file.clip, device)
-    if encoder.identity != file.clip_identity:
+    if not same_clip(encoder.identity, file.clip_identity):
         raise UserError(
             f"the CLIP in {file.clip} is not the one that this scene was made with: restore it, or train anew"
         )

@@ -71,7 +71,8 @@ def parse_prompts(typed: str) -> list[Prompt]:
     Quotes protect a phrase. The grammar is in `query/language.py`. Raises UserError if there is no prompt."""
     (clean,) = texts_of([typed], "a prompt")
     clean = _SINGLE_QUOTES.sub(r'"\1"', clean.translate(_CURLY_QUOTES)).replace("\0", " ")
-    found = phrases_of(clean)
+    # Single spaces, since runs of them would take patterns a time that grows with their square.
+    found = phrases_of(" ".join(clean.split()))
     if not found:
         raise UserError("the prompt is empty: type what to look for, such as rose window")
     if alone := [negatives for text, negatives in found if not text]:
@@ -99,7 +100,7 @@ _NO_NAME = re.compile(r"an?|the|and|or|of|in|on|at|to|it|is|are|this|that|these|
 
 def caution(text: str) -> str | None:
     """Return a warning about a prompt that names nothing, such as *the* or *42*, or that has words which CLIP
-    can't tell (places, sizes, colors); None for others."""
+    can't tell (places, sizes, colors, an unquoted *not*); None for others."""
     if all(_NO_NAME.fullmatch(word) for word in re.findall(r"\w+", text.casefold())):
         return f"{text} names nothing that can be seen: what follows is chance"
     if len(text.split()) > _MOST_WORDS:

@@ -19,6 +19,7 @@ from torch import Tensor
 from lang3dxl_ns.query.doubt import doubtful
 from lang3dxl_ns.query.engine import QueryEngine
 from lang3dxl_ns.query.vocabulary import same_thing
+from lang3dxl_ns.scene.record import same_clip
 
 Level = Literal["sure", "uncertain", "doubtful"]
 ANCHORS = ("window", "door", "tower", "spire", "dome", "roof", "wall", "arch", "column")
@@ -141,6 +142,6 @@ def known_world(clip_identity: str | None) -> tuple[Float[Tensor, " c"], Float[T
     from safetensors import safe_open
 
     with safe_open(KNOWN_WORLD, "pt") as file:
-        if file.metadata()["clip"] != clip_identity:
+        if not same_clip(file.metadata()["clip"], clip_identity):
             return None
         return file.get_tensor("mean"), file.get_tensor("precision")

@@ -15,7 +15,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from lang3dxl_ns.common.console import say, tracked
-from lang3dxl_ns.common.files import check_regular, write_atomically
+from lang3dxl_ns.common.files import check_regular, replace_file
 from lang3dxl_ns.preparation.store import hash_tensors
 from lang3dxl_ns.rendering import Backend, Splats, composite
 from lang3dxl_ns.rendering.gathering import filled_pixels
@@ -129,7 +129,7 @@ def save_visible(path: Path, views: Mapping[str, VisibleGaussians], key: str) ->
         "counts": torch.tensor([len(view.rows) for view in views.values()]),
     }
     try:
-        write_atomically(path, save(tensors, {"key": key, "checksum": fingerprint(tensors, key)}))
+        replace_file(path, save(tensors, {"key": key, "checksum": fingerprint(tensors, key)}))
     except OSError as error:
         say(f"{path} can't be cached ({error.strerror}): it will be made again the next time")
 

@@ -167,6 +167,12 @@ class Camera:
         """Return the camera without gradient."""
         return replace(self, view_matrix=self.view_matrix.detach(), intrinsics=self.intrinsics.detach())
 
+    def same_as(self, other: Camera) -> bool:
+        """Return whether another camera has the same pose, lens and size, so that views of both coincide."""
+        parts = ((self.view_matrix, other.view_matrix), (self.intrinsics, other.intrinsics))
+        size = (self.width, self.height) == (other.width, other.height)
+        return size and all(torch.equal(one.cpu(), another.cpu()) for one, another in parts)
+
     def to(self, device: torch.device | str) -> Camera:
         """Return the camera on a device."""
         view, intrinsics = (to_device(part, device) for part in (self.view_matrix, self.intrinsics))

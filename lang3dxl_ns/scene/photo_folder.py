@@ -21,7 +21,7 @@ from scipy import ndimage
 
 from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import DAMAGE, UserError
-from lang3dxl_ns.common.files import expanded, read_json, write_atomically
+from lang3dxl_ns.common.files import expanded, read_json, replace_file
 from lang3dxl_ns.common.pictures import (
     OTHER_SUFFIXES,
     PHOTO_SUFFIXES,
@@ -190,7 +190,7 @@ def extract_frames(video: Path, rate: float = FRAMES_PER_SECOND, most: int = MOS
     if len(sharpness) < 3:
         raise UserError(f"{video} has {len(sharpness)} frames: a scene needs a walk of some seconds")
     _write(video, folder, _sharpest(sharpness, min(stretches, len(sharpness))))
-    write_atomically(made_of, json.dumps(this))
+    replace_file(made_of, json.dumps(this))
     return folder
 
 

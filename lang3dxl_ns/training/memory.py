@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import torch
 
+from lang3dxl_ns.common.kernels import MOST_SUMS
 from lang3dxl_ns.common.memory import machine_memory
 from lang3dxl_ns.training.state import Training
 
@@ -35,7 +36,9 @@ def bytes_of(run: Training, pixels: int) -> tuple[float, float]:
     words = WORDS if run.learns_words_at_the_end else 0.0
     codes = run.gaussians["codes"] if run.learns_from_renderings and "codes" in run.gaussians else None
     of_codes = 0.0 if codes is None else PER_CODE * codes.shape[1]
-    fixed = PER_PARAMETER * others + max(PER_PIXEL * pixels, words)
+    # Of two threads, `PER_GAUSSIAN` has the sums.
+    many = run.gaussians["means"].device.type == "cpu" and torch.get_num_threads() > 2
+    fixed = PER_PARAMETER * others + max(PER_PIXEL * pixels, words) + many * MOST_SUMS
     looks = 0.0 if run.parts.appearance is None else PER_LOOK
     return fixed, PER_PARAMETER * numbers + PER_GAUSSIAN + of_codes + looks
 

@@ -92,6 +92,11 @@ class Training:
         self.densification.still = 0 if self.parts.sky is None else len(self.parts.sky)
 
     @property
+    def means(self) -> Tensor:
+        """Centers of the Gaussians [n, 3], world units."""
+        return self.gaussians["means"]
+
+    @property
     def device(self) -> torch.device:
         """The device of the Gaussians."""
         return self.gaussians["means"].device
@@ -169,6 +174,26 @@ class Training:
             harmonics = of_training.harmonics(g)[:, : (self.degree + 1) ** 2]
         gaussians = vars(of_training.activated(g))
         return Splats(**gaussians, harmonics=harmonics, antialiased=self.antialiased)
+
+    def to(self, device: torch.device | str) -> None:
+        """Move Gaussians and parts to a device, in place."""
+        for module in (self.gaussians, *self.parts.modules().values()):
+            module.to(device)
+
+    def tensors(self) -> dict[str, Any]:
+        """Return all tensors of Gaussians and parts by name, as in checkpoints."""
+        modules = {"gauss_params": self.gaussians, **self.parts.modules()}
+        found = {f"{m}.{n}": v for m, module in modules.items() for n, v in module.state_dict().items()}
+        if (semantics := self.parts.semantics) is not None:
+            found |= {"clip_mean": semantics.clip_mean, "dense_mean": semantics.dense_mean}
+        return found
+
+    def load(self, tensors: Mapping[str, Any]) -> None:
+        """Load `tensors` of a run with the same settings."""
+        self.match(tensors)
+        for name, module in {"gauss_params": self.gaussians, **self.parts.modules()}.items():
+            own = {k.removeprefix(f"{name}."): v for k, v in tensors.items() if k.startswith(f"{name}.")}
+            module.load_state_dict(own)
 
     def match(self, state: Mapping[str, Any]) -> None:
         """Give Gaussians and parts the shapes of a checkpoint's tensors, of any number of Gaussians, with or

@@ -539,7 +539,7 @@ function hideFloaters() {
 // ── start ──
 
 async function fetched(name) {
-  const file = await fetch(name);
+  const file = await fetch(about?.files?.[name] ?? name); // a written page's data have names by content
   if (!file.ok) throw new Error(`${name} is missing (${file.status}): write the page again.`);
   return file;
 }

@@ -23,6 +23,8 @@ PHOTO_SIDE, _QUALITY = 720, 80
 """Longer side in pixels of a page's photos, and quality of their JPEGs."""
 MOST_CAMERAS = 400
 """Most photos whose cameras a page knows; evenly spaced ones are kept."""
+_ROOM = 1.06
+"""Room around what the overview shows besides its photo."""
 _CUT, _WIDER, _BEHIND = 0.003, 1.6, 1.5
 """Share of what a scene's views show that may lie beyond each side of the overview; how much farther than its
 photo an overview reaches; and how much farther than the middle of the scene what it shows may lie."""
@@ -86,8 +88,8 @@ def extent(scene: Scene) -> list[float]:
         slopes, order = (places[:, axis] / places[:, 2]).sort()
         share = mass[order].cumsum(0) / mass.sum()
         low, high = (int((share < level).sum().clamp_max(len(share) - 1)) for level in (_CUT, 1 - _CUT))
-        ends[axis] = min(own[axis], max(float(slopes[low]), _WIDER * own[axis]))
-        ends[axis + 2] = max(own[axis + 2], min(float(slopes[high]), _WIDER * own[axis + 2]))
+        ends[axis] = min(own[axis], max(_ROOM * float(slopes[low]), _WIDER * own[axis]))
+        ends[axis + 2] = max(own[axis + 2], min(_ROOM * float(slopes[high]), _WIDER * own[axis + 2]))
     return [*ends, middle]
 
 

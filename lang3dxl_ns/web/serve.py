@@ -99,6 +99,8 @@ class Handler(BaseHTTPRequestHandler):
 
     def do_GET(self) -> None:
         """Answer the request, unless access is refused."""
+        if self.headers.get("Transfer-Encoding") or self.headers.get("Content-Length", "0") != "0":
+            self.close_connection = True  # the body, which nothing reads, is not another request
         self._answer(lambda: self.server.answer(self.path))
 
     def do_POST(self) -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,7 +18,7 @@ from torch import Tensor
 
 from lang3dxl_ns.common.console import tracked
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.common.files import make_folder, write_atomically
+from lang3dxl_ns.common.files import make_folder, replace_file
 from lang3dxl_ns.common.pictures import PHOTO_SUFFIXES
 from lang3dxl_ns.files.scene_file import Provenance
 from lang3dxl_ns.query import view_ranking
@@ -60,6 +62,10 @@ _RULES = {
 _RANKING = ("PEAK", "LARGE", "RIM", "STRONG", "CORE", "JOINED", "OUTLIERS", "DENSE")
 _TEXTS = 256
 """Number of texts encoded at a time."""
+_DATA = re.compile(
+    r"(splats|codes|field|rows|vocabulary|views|look\d+|photo\d+)\.[0-9a-f]{12}\.(bin|json|jpg)"
+)
+"""Names of a page's data files. Nothing else in its folder is ever deleted."""
 MOST_TEXT = 2_000
 """Most characters of a phrase, of which CLIP reads about 300."""
 
@@ -302,19 +308,30 @@ def write_page(page: Page, folder: Path) -> int:
     taken = [path.name for path in here if path.name in names or path.suffix.lower() in other]
     if taken and not ours:
         raise UserError(f"{folder} holds {taken[0]}, which is not a scene's page: name a folder of its own")
-    files, earlier = page.files(), _photos_of(folder)
-    for name, content in files.items():
-        write_atomically(folder / name, content)
+    files = page.files()
+    own, data = [path.name for path in _FILES], sorted(files.keys() - {path.name for path in _FILES})
+    data.remove("scene.json")
+    # Data have names by content, which scene.json lists: a page whose writing is stopped, or whose files a
+    # browser or a copy keeps from earlier, never shows the splats of one scene with the words of another.
+    named = {name: _by_content(name, files[name]) for name in data}
+    about = json.loads(files["scene.json"]) | {"files": named}
+    for camera in about["cameras"]:
+        camera["photo"] = named.get(camera["photo"], camera["photo"])
+    for name in own[:1] if not ours else []:  # marks the folder as ours
+        replace_file(folder / name, files[name])
+    for name, stored in named.items():
+        replace_file(folder / stored, files[name])
+    for name in own:
+        replace_file(folder / name, files[name])
+    files["scene.json"] = json.dumps(about).encode()
+    replace_file(folder / "scene.json", files["scene.json"])
     for path in here:  # of the page that this one replaces
-        if (path.suffix == ".bin" or path.name in earlier) and path.name not in files:
-            path.unlink()
+        if ours and _DATA.fullmatch(path.name) and path.name not in named.values():
+            path.unlink(missing_ok=True)
     return sum(map(len, files.values()))
 
 
-def _photos_of(folder: Path) -> set[str]:
-    """Return the names of the photos of the page in a folder, if it holds one."""
-    try:
-        cameras = json.loads((folder / "scene.json").read_bytes())["cameras"]
-        return {f"photo{i}.jpg" for i in range(len(cameras))} & {camera["photo"] for camera in cameras}
-    except (OSError, ValueError, LookupError, TypeError):
-        return set()  # no page, an older one, or a damaged one
+def _by_content(name: str, content: bytes) -> str:
+    """Return a file's name with a hash of its content: splats.0123456789ab.bin."""
+    stem, _, ending = name.rpartition(".")
+    return f"{stem}.{hashlib.sha256(content).hexdigest()[:12]}.{ending}"

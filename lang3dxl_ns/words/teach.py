@@ -15,6 +15,7 @@ from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.query.answer import check_views
 from lang3dxl_ns.query.answering import Answering
 from lang3dxl_ns.query.text import taught_prompt
+from lang3dxl_ns.scene.record import same_clip
 from lang3dxl_ns.words.learn_word import Weights, learn
 from lang3dxl_ns.words.taught_words import Example, TaughtWord, known_word
 
@@ -44,7 +45,8 @@ def carried_word(scene: Answering, word: TaughtWord) -> TaughtWord:
     if word.scene == Path(scene.file.data).name and len(marked) > len(word.examples) / 2:
         with suppress(UserError):
             return learned_word(scene, word.name, marked)
-    if len(word.vector) != scene.semantics()[0].clip_dim or word.clip != scene.file.clip_identity:
+    same = same_clip(word.clip, scene.file.clip_identity)
+    if len(word.vector) != scene.semantics()[0].clip_dim or not same:
         raise UserError(f"{word.name!r} was learned with another CLIP than this scene's: teach it anew")
     return replace(word, examples=(), precision={})
 

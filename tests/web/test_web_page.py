@@ -57,7 +57,8 @@ THINK = """async ([job, input]) => {
       };
       worker.postMessage({ id: 1, job, input });
     });
-    await think("load", { description, splats: await (await fetch("splats.bin")).arrayBuffer() });
+    const splats = await fetch(description.files?.["splats.bin"] ?? "splats.bin");
+    await think("load", { description, splats: await splats.arrayBuffer() });
     return worker;
   })();
   const output = await think(job, input);
@@ -810,11 +811,15 @@ def test_a_page_of_other_people_is_not_replaced(scene, tmp_path):
         assert [path.read_text() for path in folder.iterdir()] == ["mine"]
     (tmp_path / "own").mkdir()
     (tmp_path / "own" / "CNAME").write_text("mine")
-    for _ in range(2):  # the second over its own, without what is left of another scene's page
-        write_page(Page(scene), tmp_path / "own")
-        left = {path.name for path in (tmp_path / "own").iterdir()}
-        (tmp_path / "own" / "look7.bin").touch()
-    assert "look7.bin" not in left and "CNAME" in left
+    (own := tmp_path / "own" / "model.bin").parent.mkdir(exist_ok=True)
+    write_page(Page(scene), own.parent)
+    before = set(json.loads((own.parent / "scene.json").read_text())["files"].values())
+    own.write_text("mine")
+    write_page(Page(scene, more=["zoo"]), own.parent)  # without what is left of the page before
+    after = set(json.loads((own.parent / "scene.json").read_text())["files"].values())
+    left = {path.name for path in own.parent.iterdir()}
+    assert before - after and not (before - after) & left and after <= left
+    assert {"CNAME", "model.bin"} <= left
 
 
 def test_a_page_whose_writing_was_stopped_is_written_again(scene, tmp_path, monkeypatch):
@@ -827,7 +832,7 @@ def test_a_page_whose_writing_was_stopped_is_written_again(scene, tmp_path, monk
         path.write_bytes(content)
 
     with monkeypatch.context() as patched:
-        patched.setattr("lang3dxl_ns.web.write_page.write_atomically", stop)
+        patched.setattr("lang3dxl_ns.web.write_page.replace_file", stop)
         with pytest.raises(KeyboardInterrupt):
             write_page(Page(scene), tmp_path)
     assert write_page(Page(scene), tmp_path) == sum(path.stat().st_size for path in tmp_path.iterdir())

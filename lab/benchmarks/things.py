@@ -1,0 +1,143 @@
+"""`lang3dxl benchmark things`: instances, counts and boxes against what the generator built."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray as Array
+from scipy.optimize import linear_sum_assignment
+
+from lab.landmark.instances import TrueThing, placed, seen_things
+from lab.landmark.labels import CATEGORIES
+from lab.reports import command_line
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.reports import markdown_table, write_report
+from lang3dxl_ns.query.scene import Scene
+from lang3dxl_ns.things.find import Things, things_of
+from lang3dxl_ns.things.thing import Thing
+
+NEAR = 0.6
+"""A thing is found if a center is this close to its own, relative to its longest edge."""
+_SAMPLES = 20
+"""Points per axis in which two boxes are compared."""
+
+
+@dataclass
+class ThingsBenchmark:
+    """Score the things of trained demo scenes: F1, counts, 3-D IoU of boxes, time."""
+
+    scene: tuple[Path, ...]
+    """Scene files or runs of demo scenes, as `lang3dxl query` takes them."""
+    data: tuple[Path, ...]
+    """Folder of each scene's photos, which holds its scene.json."""
+    out: Path
+    """Folder for things.md and things.json."""
+
+    def main(self) -> None:
+        from lang3dxl_ns.open_scene import load_scene
+
+        if len(self.scene) != len(self.data):
+            raise UserError("give as many --data folders as scenes")
+        rows: list[Score] = []
+        seconds: dict[str, float] = {}
+        for path, data in zip(self.scene, self.data, strict=True):
+            scene, truth = load_scene(path), true_things_of(load_scene(path), data)
+            scene.mass  # noqa: B018 — measured once per scene, at the first query
+            start = time.process_time()
+            answers = things_of(scene, list(CATEGORIES))
+            seconds[data.parent.name] = time.process_time() - start
+            rows += [score(answer, truth, data.parent.name) for answer in answers]
+        table = markdown_table(
+            ["word", "seen", "found", "false", "F1", "count off (median)", "in range", "box IoU"],
+            [_summary(word, [row for row in rows if row.word == word]) for word in CATEGORIES],
+        )
+        times = ", ".join(f"{name} {t:.1f}" for name, t in seconds.items())
+        command = command_line("lang3dxl benchmark things", self)
+        text = f"# Things\n\n    {command}\n\n{table}\n\nProcessor seconds per catalog: {times}\n"
+        each = [vars(row) for row in rows]
+        write_report(self.out, "things", text, {"scores": each, "seconds": seconds})
+        print(text)
+
+
+@dataclass(frozen=True)
+class Score:
+    """Score of one word in one scene."""
+
+    scene: str
+    word: str
+    seen: int
+    """True things that the photos show."""
+    found: int
+    false: int
+    """Things found where there are none. Those at true things that the photos hardly show don't count."""
+    count: tuple[int, int, int]
+    """Count, and the range that it is said to lie in."""
+    ious: tuple[float, ...]
+    """Of the boxes of the things found."""
+
+    @property
+    def f1(self) -> float:
+        return 2 * self.found / max(self.seen + self.found + self.false, 1)
+
+    @property
+    def off(self) -> float:
+        """Relative error of the count."""
+        return abs(self.count[0] - self.seen) / max(self.seen, 1)
+
+
+def true_things_of(scene: Scene, data: Path) -> list[TrueThing]:
+    """Return the true things in the scene's frame."""
+    matrix, scale = np.array(scene.file.transform), scene.file.scale
+    stretch = np.cbrt(np.linalg.det(matrix[:, :3]))
+    frame = scale * stretch, matrix[:, :3] / stretch, scale * matrix[:, 3]
+    return [placed(thing, *frame, thing.pixels) for thing in seen_things(data)]
+
+
+def score(answer: Things, truth: Sequence[TrueThing], scene: str = "") -> Score:
+    """Compare the answer to one word with the true things of that word, each matched once."""
+    own = [thing for thing in truth if thing.word == answer.word]
+    seen, hidden = ([t for t in own if t.seen is shown] for shown in (True, False))
+    pairs = matched(answer.things, seen)
+    free = [t for i, t in enumerate(answer.things) if i not in {a for a, _ in pairs}]
+    false = len(free) - len(matched(free, hidden))
+    ious = tuple(box_iou(answer.things[a], seen[b]) for a, b in pairs)
+    count = len(answer.things), answer.least, answer.most
+    return Score(scene, answer.word, len(seen), len(pairs), false, count, ious)
+
+
+def matched(things: Sequence[Thing], truth: Sequence[TrueThing]) -> list[tuple[int, int]]:
+    """Match things with true ones so that as many as possible are found; return pairs of indices."""
+    if not things or not truth:
+        return []
+    centers, places = np.array([t.center for t in things]), np.array([t.center for t in truth])
+    size = np.array([t.size.max() for t in truth])
+    apart = np.linalg.norm(centers[:, None] - places, axis=2) / size
+    pairs = zip(*linear_sum_assignment(np.where(apart < NEAR, apart - 10, 0.0)), strict=True)
+    return [(int(a), int(b)) for a, b in pairs if apart[a, b] < NEAR]
+
+
+def box_iou(a: Thing | TrueThing, b: Thing | TrueThing) -> float:
+    """Estimate intersection over union of two oriented boxes, by points in the first."""
+    steps = (np.arange(_SAMPLES) + 0.5) / _SAMPLES - 0.5
+    grid = np.stack(np.meshgrid(steps, steps, steps), axis=-1).reshape(-1, 3)
+    points = (grid * a.size) @ a.axes + a.center
+    inside = (abs((points - b.center) @ b.axes.T) <= b.size / 2).all(1).mean()
+    volumes: Float[Array, "2"] = np.array([a.size.prod(), b.size.prod()])
+    shared = inside * volumes[0]
+    return float(shared / max(volumes.sum() - shared, 1e-30))
+
+
+def _summary(word: str, rows: Sequence[Score]) -> list[str]:
+    there, false = [row for row in rows if row.seen], sum(row.false for row in rows)
+    if not there:
+        return [word, "0", "", str(false), "", "", "", ""]
+    ious = [iou for row in there for iou in row.ious]
+    in_range = np.mean([row.count[1] <= row.seen <= row.count[2] for row in there])
+    return [word, str(sum(row.seen for row in there)), str(sum(row.found for row in there)), str(false),
+            f"{np.mean([row.f1 for row in there]):.2f}", f"{np.median([row.off for row in there]):.0%}",
+            f"{in_range:.0%}", f"{np.mean(ious):.2f}" if ious else ""]  # fmt: skip

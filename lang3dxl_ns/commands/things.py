@@ -1,0 +1,92 @@
+"""`lang3dxl things`: single things of a scene, listed, counted and asked for."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import tyro
+
+from lang3dxl_ns.common.console import say
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.settings_help import showing
+from lang3dxl_ns.open_scene import load_scene
+from lang3dxl_ns.query.scene import Scene
+from lang3dxl_ns.things.find import things_of, up_of
+from lang3dxl_ns.things.grammar import Sight, answer, parse
+from lang3dxl_ns.things.thing import Thing
+from lang3dxl_ns.things.write import write_catalog, write_picture, write_things
+
+
+@showing("scene", "text", "ask", "out", "splats", "view")
+@dataclass(kw_only=True)
+class ListThings:
+    """List the single things that words name: windows, portals, towers. Write things.json (boxes, scores, photos,
+    what is in what), things.csv, instances.json (COCO boxes in all photos) and things.png (numbered boxes)."""
+
+    scene: tyro.conf.Positional[Path | None] = None
+    """A .scene file, a folder that holds one, or a run (default: the newest run under outputs/)."""
+    text: tyro.conf.UseAppendAction[list[str]] = field(default_factory=list)
+    """Word for things, such as windows. Repeat the flag for more."""
+    ask: tyro.conf.UseAppendAction[list[str]] = field(default_factory=list)
+    """Question, such as "how many windows", "highest tower", "third window from the left" or "windows above
+    the portal". Repeat the flag for more."""
+    view: str | None = None
+    """Photo from which left and right are told (default: the one that shows the things best)."""
+    out: Path | None = None
+    """Folder for the files."""
+    splats: bool = False
+    """Write a splat file for each thing too."""
+    clip: str | None = None
+    """Name or folder of the scene's CLIP, if it is not where the scene file says."""
+
+    def main(self) -> None:
+        requests = [(text, parse(text)) for text in self.ask]
+        words = list(
+            dict.fromkeys([*self.text, *(word for _, request in requests for word in request.words)])
+        )
+        if not words:
+            raise UserError("give --text or --ask: say which things to look for, such as --text windows")
+        if self.splats and self.out is None:
+            raise UserError("--splats writes files: give --out too")
+        scene = load_scene(self.scene, clip=self.clip)
+        if self.view is not None:
+            scene.file.photo(self.view)
+        answers = things_of(scene, words)
+        by_word = dict(zip(words, answers, strict=True)) if len(answers) == len(words) else {}
+        for one in answers:
+            say(f"{one.word}: {one.count}" + (f" ({one.caution})" if one.caution else ""))
+        for text, request in requests:
+            if not by_word:
+                raise UserError("--text holds several prompts: repeat the flag instead")
+            named = [by_word[word] for word in request.words]
+            chosen = answer(request, named, lambda things: sight_of(scene, things, self.view))
+            whole = request.count and not (request.relation or request.without)
+            told = by_word[request.word].count if whole else str(len(chosen))
+            listed = ", ".join(_described(thing) for thing in chosen)
+            say(f"{text}: {told if request.count else listed or 'none found'}")
+        if self.out is not None:
+            write_catalog(scene, answers, self.out)
+            write_picture(scene, answers, self.out / "things.png")
+            if self.splats:
+                write_things(scene, answers, self.out / "splats")
+            say(f"Wrote the things to {self.out}")
+
+
+def sight_of(scene: Scene, things: list[Thing], photo: str | None = None) -> Sight:
+    """Return the directions of a photo's viewer; by default of the photo that shows most of the things."""
+    names = [sighting.photo for thing in things for sighting in thing.sightings]
+    if photo is None and names:
+        photo = max(sorted(set(names)), key=names.count)
+    shown = scene.overview if photo is None else scene.file.photo(photo)
+    up = up_of(scene)
+    ahead = -np.array(shown.camera_to_world)[:, 2]
+    ahead = ahead - up * (ahead @ up)
+    ahead /= max(np.linalg.norm(ahead), 1e-9)
+    return Sight(np.cross(ahead, up), up, ahead)
+
+
+def _described(thing: Thing) -> str:
+    seen = f", best seen in {thing.sightings[0].photo}" if thing.sightings else ""
+    return f"{thing.word} {thing.id}{seen}"

@@ -1,0 +1,156 @@
+"""`things_of`: the things of a scene that words name, how many there are, and how sure that is."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from numpy import ndarray as Array
+from torch import Tensor
+
+from lang3dxl_ns.query.doubt import doubtful, peaks
+from lang3dxl_ns.query.scene import Scene
+from lang3dxl_ns.rendering import composite
+from lang3dxl_ns.things.join import VIEWS, Joined, join, without_crumbs
+from lang3dxl_ns.things.pieces import LEVELS, Piece, Shown, pieces_of
+from lang3dxl_ns.things.thing import Sighting, Thing, upright_box
+
+_COLORED = 20
+"""Number of Gaussians within and around the matches below which colors tell nothing."""
+_SAME = 0.5
+"""Overlap (intersection over union of weights) from which two words' things are one."""
+
+
+@dataclass(frozen=True, eq=False)
+class Things:
+    """The things that one word finds."""
+
+    word: str
+    things: list[Thing]
+    least: int
+    """Number of the things that three or more photos show."""
+    most: int
+    """Number of the things and of the candidates that a single photo shows."""
+    caution: str | None = None
+    """Why the answer is doubtful; None if it isn't."""
+
+    @property
+    def count(self) -> str:
+        """How many there are, such as "34, perhaps 31 to 37"."""
+        sure = f"{len(self.things)}"
+        return sure if self.least == self.most else f"{sure}, perhaps {self.least} to {self.most}"
+
+
+def things_of(scene: Scene, texts: str | Sequence[str]) -> list[Things]:
+    """Find the single things that each prompt of `texts` names.
+
+    Every training view's heat map falls into pieces (`pieces_of`), and pieces of several views are one thing
+    where they share Gaussians (`join`). Where a prompt's colors differ from those around it, colors separate
+    neighbors: the wall between two windows that CLIP sees as one.
+
+    Raises UserError as `Scene.ask` does.
+    """
+    question = scene.ask(texts)
+    mass = scene.mass.double().cpu().numpy()
+    up = up_of(scene)
+    sharp = [_sharpened(scene, relevancy) for relevancy in question.relevancy]
+    # A word whose peak stays below the lowest level names nothing here.
+    present = (peaks(question.relevancy) > LEVELS[0]).tolist()
+    pieces: list[list[Piece]] = [[] for _ in sharp]
+    for views in _views(scene, torch.stack(sharp, 1)):
+        for found, shown, there in zip(pieces, views, present, strict=True):
+            found += pieces_of(shown) if there else []
+    answers, known = list[Things](), list[Thing]()
+    for i, prompt in enumerate(question.prompts):
+        weight = np.sqrt(mass) * question.relevancy[i].double().cpu().numpy()
+        joined = without_crumbs(join(pieces[i], weight))
+        sure = [one for one in joined if one.views >= VIEWS]
+        things = [_thing(scene, prompt.text, one, mass, question.relevancy[i], up) for one in sure]
+        things = [_known(thing, known, mass) for thing in things]
+        known += things
+        least = sum(one.views > VIEWS for one in joined)
+        caution = doubtful(prompt.text, question.doubts[i], prompt.taught is not None)
+        answers.append(Things(prompt.text, things, least, len(joined), caution))
+    return answers
+
+
+def up_of(scene: Scene) -> Float[Array, "3"]:
+    """Return the unit vector that points up: where photos tell it, theirs; otherwise the cameras' mean."""
+    told = scene.file.georeference
+    up = np.array([photo.camera_to_world for photo in scene.photos])[:, :, 1].mean(0)
+    up = up if told is None else np.asarray(told.up, dtype=np.float64)
+    return up / max(np.linalg.norm(up), 1e-9)
+
+
+def _sharpened(scene: Scene, relevancy: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
+    """Multiply relevancies by how much a Gaussian's color is that of the matches, and not of what is around
+    them."""
+    from scipy.spatial import KDTree
+    from sklearn.linear_model import LogisticRegression  # imported here, since the import takes a second
+
+    means, colors = scene.splats.means.cpu().numpy(), scene.splats.harmonics[:, 0].cpu().numpy()
+    values, mass = relevancy.cpu().numpy(), scene.mass.cpu().numpy()
+    match = np.flatnonzero((values > 0.9) & (mass > 0))
+    if len(match) < _COLORED:
+        return relevancy
+    near = np.isfinite(KDTree(means[match]).query(means, distance_upper_bound=scene.gap)[0])
+    around = np.flatnonzero((values < 0.5) & near & (mass > 0))
+    if len(around) < _COLORED:
+        return relevancy
+    rows = np.concatenate([match, around])
+    weight = np.sqrt(mass[rows]) * len(rows) / 2
+    weight[: len(match)] /= np.sqrt(mass[match]).sum()
+    weight[len(match) :] /= np.sqrt(mass[around]).sum()
+    model = LogisticRegression(C=10).fit(
+        colors[rows], np.arange(len(rows)) < len(match), sample_weight=weight
+    )
+    return relevancy * torch.from_numpy(model.predict_proba(colors)[:, 1]).to(relevancy)
+
+
+@torch.no_grad()
+def _views(scene: Scene, heat: Float[Tensor, "n q"]) -> Iterator[list[Shown]]:
+    """Render each training view's heat maps at the size that it was trained at."""
+    means, splats = scene.splats.means, scene.splats
+    for name, view in scene.visible.items():
+        photo = scene.file.photo(name)
+        camera = photo.camera
+        pose = camera.view_matrix.to(means)
+        seen = means @ pose[:3, :3].T + pose[:3, 3]
+        channels = torch.cat([heat.to(means), seen[:, 2:], torch.ones_like(seen[:, 2:])], 1)
+        drawn = composite(splats, camera, channels, scene.backend).cpu().numpy()
+        *maps, depth, alpha = np.moveaxis(drawn, 2, 0)
+        inside = photo.foreground((camera.height, camera.width))
+        keep = 1.0 if inside is None else inside.numpy()
+        rows = view.rows.long().cpu().numpy()
+        points = seen.cpu().numpy()[rows]
+        lens = camera.intrinsics.cpu().numpy()
+        points = np.column_stack([(points / points[:, 2:]) @ lens[:2].T, points[:, 2]])
+        surface = depth / np.maximum(alpha, 1e-3)
+        yield [Shown(name, one * keep, surface, rows, points, float(lens[0, 0])) for one in maps]
+
+
+def _thing(
+    scene: Scene, word: str, one: Joined, mass: Float[Array, " n"], relevancy: Tensor, up: Float[Array, "3"]
+) -> Thing:
+    rows, values = one.rows, relevancy.double().cpu().numpy()[one.rows]
+    weight = np.sqrt(mass[rows]) * values
+    center, axes, size = upright_box(scene.splats.means.double().cpu().numpy()[rows], weight, up)
+    best: dict[str, Piece] = {}
+    for piece in sorted(one.votes, key=lambda piece: (piece.cut, -piece.area)):
+        best.setdefault(piece.photo, piece)
+    score = float(np.average(values, weights=np.maximum(mass[rows], 1e-9)))
+    sightings = [Sighting(name, piece.box) for name, piece in best.items()]
+    number = int(rows[mass[rows].argmax()])
+    return Thing(number, word, score, one.views, center, axes, size, rows, sightings)
+
+
+def _known(thing: Thing, known: Sequence[Thing], mass: Float[Array, " n"]) -> Thing:
+    """Give a thing the id of one that another word found at the same place."""
+    for other in known:
+        shared = mass[np.intersect1d(thing.rows, other.rows)].sum()
+        if shared > _SAME * mass[np.union1d(thing.rows, other.rows)].sum():
+            return replace(thing, id=other.id)
+    return thing

@@ -1,0 +1,180 @@
+"""Questions about things: counts, superlatives, ordinals and relations, from one table (`grammar.json`).
+
+Up is the cameras'. Left and right are those of the given view, or else of someone who faces the things that the
+question is about: of the photo that shows them best.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray as Array
+
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.files import read_json
+from lang3dxl_ns.things.find import Things
+from lang3dxl_ns.things.thing import Thing
+
+_BESIDE = 1.5
+"""Distance, relative to the mean longest edge of two things, up to which they are next to each other."""
+_INSIDE = 0.7
+"""Half-size of a box, relative to its own edges, within which a center is in or on it."""
+
+
+@cache
+def table() -> dict[str, Any]:
+    """Load the grammar's words."""
+    return read_json(Path(__file__).with_suffix(".json"))
+
+
+@dataclass(frozen=True)
+class Request:
+    """What a question asks for."""
+
+    word: str
+    """Prompt of the things that it is about."""
+    count: bool = False
+    superlative: str | None = None
+    nth: int | None = None
+    """Place in the order `along`, from 1."""
+    along: str | None = None
+    """Side from which things are numbered."""
+    relation: str | None = None
+    others: tuple[str, ...] = ()
+    """Prompts of the things that the relation refers to."""
+    without: str | None = None
+    """Prompt of things that are left out."""
+
+    @property
+    def words(self) -> list[str]:
+        """All prompts, each once."""
+        return list(dict.fromkeys([self.word, *self.others, *([self.without] if self.without else [])]))
+
+
+@dataclass(frozen=True, eq=False)
+class Sight:
+    """Directions of whoever looks: unit vectors to the right, up and away from the viewer."""
+
+    right: Float[Array, "3"]
+    up: Float[Array, "3"]
+    ahead: Float[Array, "3"]
+
+
+def parse(text: str) -> Request:
+    """Parse a question. Raises UserError, which names the part, for what the grammar doesn't know."""
+    words = table()
+    rest = " ".join(text.lower().strip(" ?!.").split())
+    count, rest = _taken(rest, words["count"])
+    _, rest = _taken(rest, words["lead"])
+    rest = re.sub(rf"\s+({_any(words['tail'])})$", "", rest)
+    without, relation, others = None, None, tuple[str, ...]()
+    if found := re.fullmatch(r"(.+?) (?:but )?not (.+)", rest):
+        rest, without = found[1], _plain(found[2])
+    along, nth, superlative = None, None, None
+    if found := re.fullmatch(rf"(.+?) (?:from|on) the ({_any(words['from'])})(?: (.+))?", rest):
+        rest, along = f"{found[1]} {found[3] or ''}".strip(), found[2]
+    if found := re.fullmatch(rf"(.+?) ({_any(words['relations'])}) (.+)", rest):
+        rest, relation = found[1], words["relations"][found[2]]
+        others = tuple(_plain(part) for part in re.split(r"\s+and\s+", found[3]))
+        if (len(others) == 2) != (relation == "between") and not (relation == "between" and len(others) == 1):
+            raise UserError(f"{found[2]} {found[3]}: name one thing, or two with between … and …")
+    rest = _plain(rest)
+    first, _, noun = rest.partition(" ")
+    if noun and first in words["superlatives"]:
+        superlative, rest = first, noun
+    elif noun and (first in words["ordinals"] or re.fullmatch(r"\d+(st|nd|rd|th)", first)):
+        nth, rest = words["ordinals"].get(first) or int(first[:-2]), noun
+        if along is None or nth < 1:
+            raise UserError(f"{first} {noun}: say from which side, such as the {first} {noun} from the left")
+    elif along is not None:
+        raise UserError(f"from the {along}: say which one, such as the second {rest} from the {along}")
+    if not rest:
+        raise UserError(f"{text!r} names no thing: ask for one, such as how many windows")
+    return Request(rest, count, superlative, nth, along, relation, others, without)
+
+
+def answer(request: Request, found: Iterable[Things], sight: Callable[[list[Thing]], Sight]) -> list[Thing]:
+    """Choose the things that a request asks for. `found` holds the things of `Request.words`; `sight` returns
+    the directions in which some things are seen. Raises UserError if a thing that the relation refers to is
+    not found, or if there are fewer things than the ordinal asks for."""
+    things = {one.word: one.things for one in found}
+    chosen = list(things[request.word])
+    if request.without:
+        gone = {thing.id for thing in things[request.without]}
+        chosen = [thing for thing in chosen if thing.id not in gone]
+    view = sight(chosen or [thing for listed in things.values() for thing in listed])
+    if request.relation:
+        for word in request.others:
+            if not things[word]:
+                raise UserError(f"no {word} found: a relation to it has no answer")
+        chosen = [
+            t for t in chosen if _related(t, request.relation, [things[w] for w in request.others], view)
+        ]
+    if request.superlative:
+        kind, sign = table()["superlatives"][request.superlative]
+        return sorted(chosen, key=lambda thing: sign * _measure(thing, kind, view))[:1]
+    if request.nth and request.along:
+        kind, sign = table()["from"][request.along]
+        if len(chosen) < request.nth:
+            raise UserError(f"only {len(chosen)} {request.word} found: there is no number {request.nth}")
+        ordered = sorted(chosen, key=lambda thing: sign * _measure(thing, kind, view))
+        return ordered[request.nth - 1 : request.nth]
+    return chosen
+
+
+def _measure(thing: Thing, kind: str, view: Sight) -> float:
+    if kind == "left":
+        return float(thing.center @ view.right)
+    if kind == "top":
+        return float(thing.center @ view.up + thing.size[2] / 2)
+    return float({"tall": thing.size[2], "wide": thing.size[:2].max()}.get(kind, np.prod(thing.size)))
+
+
+def _related(thing: Thing, relation: str, others: list[list[Thing]], view: Sight) -> bool:
+    if relation == "between":
+        pairs = [
+            (a, b) for a in others[0] for b in others[-1] if a.id != b.id and thing.id not in (a.id, b.id)
+        ]
+        return any(_between(thing, a, b) for a, b in pairs)
+    return any(holds(thing, relation, other, view) for other in others[0] if other.id != thing.id)
+
+
+def holds(thing: Thing, relation: str, other: Thing, view: Sight) -> bool:
+    """Return whether a thing stands in a relation (a value of the table's `relations`) to another one."""
+    apart = thing.center - other.center
+    if relation in ("left", "right"):
+        return bool((apart @ view.right) * (1 if relation == "right" else -1) > other.size[:2].max() / 2)
+    if relation in ("above", "below"):
+        return bool((apart @ view.up) * (1 if relation == "above" else -1) > other.size[2] / 2)
+    if relation in ("front", "behind"):
+        return bool((apart @ view.ahead) * (1 if relation == "behind" else -1) > other.size[:2].max() / 2)
+    if relation == "beside":
+        return bool(np.linalg.norm(apart) < _BESIDE * (thing.size.max() + other.size.max()) / 2)
+    return bool((abs(other.axes @ apart) <= _INSIDE * np.maximum(other.size, other.size.max() / 10)).all())
+
+
+def _between(thing: Thing, a: Thing, b: Thing) -> bool:
+    line = b.center - a.center
+    share = float((thing.center - a.center) @ line / max(line @ line, 1e-12))
+    aside = np.linalg.norm(thing.center - a.center - share * line)
+    return 0 < share < 1 and bool(aside < max(a.size.max(), b.size.max()))
+
+
+def _taken(text: str, phrases: list[str]) -> tuple[bool, str]:
+    found = re.match(rf"({_any(phrases)})\s+", text)
+    return found is not None, text[found.end() :] if found else text
+
+
+def _plain(text: str) -> str:
+    return re.sub(rf"^(?:{_any(table()['articles'])})\s+", "", text.strip())
+
+
+def _any(phrases: Iterable[str]) -> str:
+    return "|".join(sorted(map(re.escape, phrases), key=len, reverse=True))

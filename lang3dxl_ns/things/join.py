@@ -1,0 +1,100 @@
+"""Things out of pieces: pieces of several views that share Gaussians are one thing."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from itertools import combinations
+
+import numpy as np
+from jaxtyping import Float, Int
+from numpy import ndarray as Array
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+from lang3dxl_ns.things.pieces import Piece
+
+SHARED = 0.35
+"""Share of a piece's weight, or of a thing's, from which the two show the same."""
+SPLINTER = 0.25
+"""Share of a thing's weight below which a piece of it is too small to confirm it."""
+VIEWS = 2
+"""Number of views that must show a thing: what a single one shows may be a smear."""
+CRUMB = 0.03
+"""Weight, relative to the typical thing's (half of all weight is in heavier ones), below which a thing is a
+crumb of another."""
+_MOST_SHARED = 0.5
+"""Share of a piece's weight that may belong to known things if it is to be a new one."""
+
+
+@dataclass(eq=False)
+class Joined:
+    """A thing in the making."""
+
+    rows: Int[Array, " m"]
+    """Indices of its Gaussians."""
+    weight: float
+    votes: list[Piece] = field(default_factory=list)
+    """Pieces that show it alone, finest first."""
+
+    @property
+    def views(self) -> int:
+        """Number of views that show it."""
+        return len({piece.photo for piece in self.votes})
+
+
+def join(pieces: Sequence[Piece], weight: Float[Array, " n"]) -> list[Joined]:
+    """Join the pieces of all views, from the finest resolution to the coarsest.
+
+    A piece founds a thing if its Gaussians are mostly free, confirms the thing that it shares most with, and
+    says nothing if it covers several things (a coarse view joins neighbors that a fine one tells apart), or if
+    it is cut off and new. Things that some piece covers together, and no photo shows apart, are one: two
+    sides of a tower. `weight` is each Gaussian's weight, 0 and above.
+    """
+    owner, things = np.full(len(weight), -1), list[Joined]()
+    together = set[tuple[int, int]]()
+    for piece in sorted(pieces, key=lambda piece: (piece.cut, -piece.resolution)):
+        mine, total = owner[piece.rows], weight[piece.rows].sum()
+        if total <= 0:
+            continue
+        shared = np.bincount(mine[mine >= 0], weight[piece.rows][mine >= 0], minlength=len(things))
+        of_things = shared / np.array([thing.weight for thing in things]) if things else shared
+        covered = np.flatnonzero(of_things > SHARED).tolist()
+        if len(covered) > 1:
+            together.update(combinations(covered, 2))
+            continue
+        best = int(shared.argmax()) if things else -1
+        if things and (shared[best] > SHARED * total or of_things[best] > SHARED):
+            if of_things[best] >= SPLINTER and not (piece.cut and of_things[best] <= SHARED):
+                things[best].votes.append(piece)
+        elif not piece.cut and shared.sum() <= _MOST_SHARED * total:
+            rows = piece.rows[mine < 0]
+            owner[rows] = len(things)
+            things.append(Joined(rows, float(weight[rows].sum()), [piece]))
+    return [thing for thing in _united(things, together) if len(thing.rows) > 1]
+
+
+def _united(things: Sequence[Joined], together: set[tuple[int, int]]) -> list[Joined]:
+    photos = [{piece.photo for piece in thing.votes} for thing in things]
+    pairs = np.array([pair for pair in sorted(together) if not photos[pair[0]] & photos[pair[1]]])
+    ends = pairs.reshape(-1, 2).T.astype(int)
+    graph = coo_matrix((np.ones(ends.shape[1]), (ends[0], ends[1])), (len(things), len(things)))
+    count, group = connected_components(graph, directed=False) if things else (0, np.zeros(0))
+    parts = [[things[i] for i in np.flatnonzero(group == number)] for number in range(count)]
+    return [
+        Joined(
+            np.concatenate([part.rows for part in of]),
+            sum(part.weight for part in of),
+            [piece for part in of for piece in part.votes],
+        )
+        for of in parts
+    ]
+
+
+def without_crumbs(things: Sequence[Joined]) -> list[Joined]:
+    """Leave out the things that weigh far less than the typical one."""
+    weights = np.sort([thing.weight for thing in things])[::-1]
+    if not len(weights):
+        return []
+    typical = weights[np.searchsorted(weights.cumsum(), weights.sum() / 2)]
+    return [thing for thing in things if thing.weight >= CRUMB * typical]

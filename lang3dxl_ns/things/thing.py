@@ -1,0 +1,84 @@
+"""A thing of a scene, and the upright box around it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+from numpy import ndarray as Array
+
+_OUTLIERS = 0.03
+"""Share of a thing's weight that its box leaves out at either end of each axis."""
+_TURNS = 30
+"""Number of directions that are tried for a box, over a quarter turn."""
+
+
+@dataclass(frozen=True, eq=False)
+class Sighting:
+    """Where a photo shows a thing."""
+
+    photo: str
+    box: tuple[int, int, int, int]
+    """Left, top, right and bottom end in pixels of the training photo."""
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Thing:
+    """One thing: a window, a portal, a tower."""
+
+    id: int
+    """Index of its heaviest Gaussian, by which it is known whatever it is asked by."""
+    word: str
+    """Prompt that found it."""
+    score: float
+    """Mean relevancy of its Gaussians, 0…1."""
+    views: int
+    """Number of photos that show it by itself."""
+    center: Float[Array, "3"]
+    """Center of its box in the model's frame."""
+    axes: Float[Array, "3 3"]
+    """Directions of the box's edges, one a row: two level ones, then up."""
+    size: Float[Array, "3"]
+    """Lengths of the edges, world units."""
+    rows: Int[Array, " m"]
+    """Indices of its Gaussians."""
+    sightings: list[Sighting] = field(default_factory=list)
+    """Photos that show it, the best first."""
+
+    def __repr__(self) -> str:
+        where, size = (tuple(v.round(3).tolist()) for v in (self.center, self.size))
+        return f"Thing({self.id}, {self.word!r}, center {where}, size {size}, score {self.score:.2f})"
+
+    def as_json(self) -> dict[str, Any]:
+        """Return its description, without its Gaussians, for JSON."""
+        seen = [{"photo": s.photo, "box": list(s.box)} for s in self.sightings]
+        numbers = {name: getattr(self, name).round(5).tolist() for name in ("center", "axes", "size")}
+        return {"id": self.id, "word": self.word, "score": round(self.score, 3), "views": self.views,
+                **numbers, "gaussians": len(self.rows), "photos": seen}  # fmt: skip
+
+
+def upright_box(
+    points: Float[Array, "m 3"], weight: Float[Array, " m"], up: Float[Array, "3"]
+) -> tuple[Float[Array, "3"], Float[Array, "3 3"], Float[Array, "3"]]:
+    """Find the upright box with the smallest base around weighted points; return center, axes and size, as
+    `Thing` has them. `up` is a unit vector."""
+    aside = np.cross(up, np.eye(3)[abs(up).argmin()])
+    aside /= np.linalg.norm(aside)
+    ahead = np.cross(up, aside)
+    boxes = []
+    for angle in np.arange(_TURNS) * (np.pi / 2 / _TURNS):
+        level = np.cos(angle) * aside + np.sin(angle) * ahead
+        axes = np.stack([level, np.cross(up, level), up])
+        ends = np.stack([_ends(along, weight) for along in (points @ axes.T).T])
+        size = ends[:, 1] - ends[:, 0]
+        boxes.append((size[0] * size[1], size[0] + size[1], angle, ends.mean(1) @ axes, axes, size))
+    *_, center, axes, size = min(boxes, key=lambda box: box[:3])
+    return center, axes, size
+
+
+def _ends(values: Float[Array, " m"], weight: Float[Array, " m"]) -> Float[Array, "2"]:
+    order = values.argsort()
+    below = (weight[order].cumsum() - weight[order] / 2) / weight.sum()
+    return np.interp((_OUTLIERS, 1 - _OUTLIERS), below, values[order])

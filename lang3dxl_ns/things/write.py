@@ -1,0 +1,105 @@
+"""Files of things: a catalog with relations, a table, COCO instances, numbered outlines, and splats."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from PIL import Image, ImageDraw
+
+from lang3dxl_ns.common.files import make_folder, slugs, write_atomically
+from lang3dxl_ns.files.splat_file import write_splats
+from lang3dxl_ns.query.heat_maps import PROMPT_COLORS
+from lang3dxl_ns.query.scene import Scene
+from lang3dxl_ns.things.find import Things, up_of
+from lang3dxl_ns.things.grammar import Sight, holds
+from lang3dxl_ns.things.thing import Thing
+
+
+def write_catalog(scene: Scene, answers: Sequence[Things], folder: Path) -> None:
+    """Write things.json (boxes, sizes, scores, photos, and the scene graph: what is in what), things.csv and
+    instances.json (COCO boxes in all photos)."""
+    make_folder(folder)
+    things = _each_once(answers)
+    up = up_of(scene)
+    graph = [[a.id, "in", b.id] for a in things for b in things if a.id != b.id and a.size.prod() < b.size.prod()
+             and holds(a, "in", b, Sight(up, up, up))]  # fmt: skip
+    words = [{"word": one.word, "count": len(one.things), "least": one.least, "most": one.most,
+              "caution": one.caution, "things": [thing.id for thing in one.things]} for one in answers]  # fmt: skip
+    content = {"words": words, "things": [t.as_json() for t in things], "relations": graph, "up": up.tolist()}
+    write_atomically(folder / "things.json", json.dumps(content, indent=1) + "\n")
+    rows = io.StringIO()
+    table = csv.writer(rows, lineterminator="\n")
+    table.writerow(["id", "word", "score", "views", "x", "y", "z", "width", "depth", "height", "photo"])
+    for thing in things:
+        seen = thing.sightings[0].photo if thing.sightings else ""
+        numbers = [*thing.center.round(4).tolist(), *thing.size.round(4).tolist()]
+        table.writerow([thing.id, thing.word, round(thing.score, 3), thing.views, *numbers, seen])
+    write_atomically(folder / "things.csv", rows.getvalue())
+    write_atomically(folder / "instances.json", json.dumps(coco(scene, answers)) + "\n")
+
+
+def coco(scene: Scene, answers: Sequence[Things]) -> dict[str, Any]:
+    """Return the boxes of all things in all photos that show them, as COCO instances."""
+    numbers = {photo.name: i + 1 for i, photo in enumerate(scene.photos)}
+    images = [{"id": numbers[photo.name], "file_name": photo.name, "width": photo.camera.width,
+               "height": photo.camera.height} for photo in scene.photos]  # fmt: skip
+    categories = [{"id": i + 1, "name": one.word} for i, one in enumerate(answers)]
+    boxes = [(i + 1, thing, sighting) for i, one in enumerate(answers) for thing in one.things
+             for sighting in thing.sightings]  # fmt: skip
+    labels = []
+    for number, (category, thing, sighting) in enumerate(boxes, 1):
+        left, top, right, bottom = sighting.box
+        size = right - left, bottom - top
+        labels.append({"id": number, "image_id": numbers[sighting.photo], "category_id": category,
+                       "bbox": [left, top, *size], "area": size[0] * size[1], "iscrowd": 0,
+                       "score": round(thing.score, 3), "thing": thing.id})  # fmt: skip
+    return {"images": images, "categories": categories, "annotations": labels}
+
+
+def write_picture(scene: Scene, answers: Sequence[Things], path: Path) -> None:
+    """Draw numbered boxes on the rendering of the photo that shows most of the things."""
+    shown = [
+        (i, n + 1, s) for i, one in enumerate(answers) for n, t in enumerate(one.things) for s in t.sightings
+    ]
+    if not shown:
+        return
+    names = [sighting.photo for *_, sighting in shown]
+    photo = max(sorted(set(names)), key=names.count)
+    camera = scene.file.photo(photo).camera
+    view = scene.render(photo, 2 * max(camera.width, camera.height))
+    pixels = (view.rendering.rgb.clamp(0, 1) * 255).byte().cpu().numpy()
+    picture, scale = Image.fromarray(pixels), pixels.shape[1] / camera.width
+    pen = ImageDraw.Draw(picture)
+    for which, number, sighting in shown:
+        if sighting.photo == photo:
+            color = PROMPT_COLORS[which % len(PROMPT_COLORS)]
+            corners = [scale * value for value in sighting.box]
+            pen.rectangle(corners, outline=color, width=2)
+            pen.text((corners[0] + 3, corners[1] + 1), str(number), fill=color)
+    picture.save(path)
+
+
+def write_things(scene: Scene, answers: Sequence[Things], folder: Path, look: str | None = None) -> int:
+    """Write a splat file for each thing, named by word and id, and return how many were written."""
+    make_folder(folder)
+    baked, things = scene.baked(look), _each_once(answers)
+    words = dict(zip((one.word for one in answers), slugs([one.word for one in answers]), strict=True))
+    for thing in things:
+        rows = torch.from_numpy(np.sort(thing.rows)).to(scene.device)
+        write_splats(folder / f"{words[thing.word]}-{thing.id}.ply", baked.select(rows))
+    return len(things)
+
+
+def _each_once(answers: Sequence[Things]) -> list[Thing]:
+    things: dict[int, Thing] = {}
+    for one in answers:
+        for thing in one.things:
+            things.setdefault(thing.id, thing)
+    return list(things.values())

@@ -1,0 +1,151 @@
+"""Laws of things: pieces, joining, boxes and questions, on scenes that are drawn by hand."""
+
+import numpy as np
+import pytest
+
+from lab.landmark.instances import true_things
+from lab.landmark.landmark import Landmark
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.things.find import Things
+from lang3dxl_ns.things.grammar import Request, Sight, answer, parse, table
+from lang3dxl_ns.things.join import join, without_crumbs
+from lang3dxl_ns.things.pieces import Piece, Shown, pieces_of, split
+from lang3dxl_ns.things.thing import Thing, upright_box
+
+SIGHT = Sight(np.array([1.0, 0, 0]), np.array([0, 0, 1.0]), np.array([0, 1.0, 0]))
+
+
+def bumps(*columns: int) -> np.ndarray:
+    """Heat map of bumps, 9 pixels apart or more, whose skirts join."""
+    y, x = np.mgrid[:20, :60]
+    return np.maximum.reduce([np.exp(-((x - c) ** 2 + (y - 10) ** 2) / 18.0) for c in columns])
+
+
+def piece(photo: str, rows, resolution: float, cut: bool = False) -> Piece:
+    return Piece(photo, np.array(rows), resolution, len(rows), (0, 0, 9, 9), cut)
+
+
+def thing(number: int, word: str, center, size=(1.0, 1.0, 1.0)) -> Thing:
+    rows = np.array([number])
+    return Thing(number, word, 1.0, 3, np.array(center, float), np.eye(3), np.array(size, float), rows)
+
+
+def test_a_region_splits_where_it_falls_apart_and_only_there():
+    heat = bumps(12, 22, 45)
+    labels, count = split(heat)
+    assert count == 3
+    assert len({labels[10, 12], labels[10, 22], labels[10, 45], 0}) == 4
+    assert split(bumps(12, 13))[1] == 1
+    assert split(np.zeros((5, 5)))[1] == 0
+
+
+def test_hidden_gaussians_belong_to_no_piece():
+    heat, depth = bumps(20), np.full((20, 60), 5.0)
+    points = np.array([[20, 10, 5.0], [20, 10, 9.0], [50, 10, 5.0]])
+    (found,) = pieces_of(Shown("a", heat, depth, np.array([7, 8, 9]), points, 100.0))
+    assert found.rows.tolist() == [7]
+    assert found.resolution == pytest.approx(20)
+
+
+def test_a_coarse_view_does_not_join_what_a_fine_one_tells_apart():
+    fine = [piece(p, rows, 9.0) for p in "ab" for rows in ([0, 1, 2], [3, 4, 5])]
+    coarse = [piece(p, range(6), 1.0) for p in "cdefg"]
+    found = join([*coarse, *fine], np.ones(6))
+    assert sorted(sorted(one.rows.tolist()) for one in found) == [[0, 1, 2], [3, 4, 5]]
+    assert [one.views for one in found] == [2, 2]
+
+
+def test_sides_that_no_photo_shows_apart_are_one_thing():
+    sides = [piece("a", [0, 1, 2], 9.0), piece("b", [3, 4, 5], 9.0)]
+    assert len(join(sides, np.ones(6))) == 2
+    (one,) = join([*sides, piece("c", range(6), 1.0)], np.ones(6))
+    assert sorted(one.rows.tolist()) == list(range(6))
+
+
+def test_crumbs_go_and_equals_stay():
+    sizes = [np.arange(100), np.arange(100, 200), np.arange(200, 202)]
+    found = without_crumbs(join([piece("a", rows, 1.0) for rows in sizes], np.ones(202)))
+    assert [len(one.rows) for one in found] == [100, 100]
+    assert without_crumbs([]) == []
+
+
+def test_a_box_turns_with_its_points():
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-0.5, 0.5, (4000, 3)) * (4, 1, 2)
+    for angle in (0.0, 0.3, 1.1, 2.0):
+        c, s = np.cos(angle), np.sin(angle)
+        turned = points @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]) + (5, 6, 7)
+        center, axes, size = upright_box(turned, np.ones(4000), np.array([0, 0, 1.0]))
+        assert center == pytest.approx([5, 6, 7], abs=0.1)
+        assert np.sort(size) == pytest.approx([0.94, 1.88, 3.76], abs=0.25)
+        assert axes @ axes.T == pytest.approx(np.eye(3), abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("text", "request_"),
+    [
+        ("how many windows are there?", Request("windows", count=True)),
+        ("highest tower", Request("tower", superlative="highest")),
+        ("the third window from the left", Request("window", nth=3, along="left")),
+        ("windows left of the portal", Request("windows", relation="left", others=("portal",))),
+        ("the window between the portals", Request("window", relation="between", others=("portals",))),
+        ("count windows not doors", Request("windows", count=True, without="doors")),
+        ("rose window", Request("rose window")),
+        (
+            "largest window above the portal",
+            Request("window", superlative="largest", relation="above", others=("portal",)),
+        ),
+    ],
+)
+def test_questions_are_read(text, request_):
+    assert parse(text) == request_
+
+
+@pytest.mark.parametrize(
+    "text", ["third window", "windows from the left", "windows between the a and b and c", ""]
+)
+def test_what_the_grammar_does_not_know_is_said(text):
+    with pytest.raises(UserError):
+        parse(text)
+
+
+def test_questions_choose_by_place_and_size_and_mirror_with_the_viewer():
+    row = [thing(i, "window", (x, 0, 5)) for i, x in enumerate([3, 0, 9, 6])]
+    portal = thing(9, "portal", (4.5, 0, 0), (2, 1, 4))
+    found = [Things("window", row, 4, 4), Things("portal", [portal], 1, 1)]
+    mirrored = Sight(-SIGHT.right, SIGHT.up, SIGHT.ahead)
+
+    def ids(text: str, sight: Sight = SIGHT) -> list[int]:
+        return [one.id for one in answer(parse(text), found, lambda _: sight)]
+
+    assert ids("second window from the left") == [0]
+    assert ids("second window from the right") == ids("second window from the left", mirrored) == [3]
+    assert ids("leftmost window") == [1] != ids("leftmost window", mirrored)
+    assert ids("window left of the portal") == ids("window right of the portal", mirrored) == [0, 1]
+    assert ids("window above the portal") == [0, 1, 2, 3]
+    assert ids("window below the portal") == []
+    with pytest.raises(UserError, match="only 4"):
+        ids("fifth window from the left")
+
+
+def test_every_phrase_of_the_table_is_reached():
+    words = table()
+    for phrase in words["relations"]:
+        other = "doors and gates" if phrase == "between" else "doors"
+        assert parse(f"windows {phrase} {other}").relation == words["relations"][phrase]
+    for phrase in words["superlatives"]:
+        assert parse(f"{phrase} tower").superlative == phrase
+
+
+@pytest.mark.parametrize(("family", "seed"), [("cathedral", 600), ("mosque", 602), ("hall", 604)])
+def test_true_things_hold_each_solid_once(family, seed):
+    landmark = Landmark.from_seed(seed, family)
+    things, numbers = true_things(landmark)
+    held = np.concatenate(numbers)
+    assert set(held.tolist()) == set(range(len(things)))
+    for shape, own in zip(landmark.shapes, numbers, strict=True):
+        corners = shape.corners
+        for number in own.tolist():
+            center = things[number].center
+            margin = things[number].size.max()
+            assert (center > corners.min(0) - margin).all() and (center < corners.max(0) + margin).all()
