@@ -1,4 +1,4 @@
-"""True things of a landmark: each window, portal, dome, tower, spire and minaret, and which photos show it."""
+"""True things of a landmark: every window, portal, dome, tower, spire, minaret, and which photos show it."""
 
 from __future__ import annotations
 

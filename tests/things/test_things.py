@@ -101,7 +101,9 @@ def test_questions_are_read(text, request_):
     assert parse(text) == request_
 
 
-@pytest.mark.parametrize("text", ["third window", "windows from the left", "windows between the a and b and c", ""])
+@pytest.mark.parametrize(
+    "text", ["third window", "windows from the left", "windows between the a and b and c", ""]
+)
 def test_what_the_grammar_does_not_know_is_said(text):
     with pytest.raises(UserError):
         parse(text)
