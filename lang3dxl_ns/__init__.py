@@ -1,7 +1,7 @@
 """Language in large 3D scenes: Lang3D-XL as a nerfstudio plugin.
 
-Each public name loads its module at first use, so importing the package costs nothing. Only `train`, and
-`load_scene` for runs without a scene file, need nerfstudio.
+Each public name loads its module at first use, so importing the package costs nothing. Only `load_scene` for
+runs without a scene file needs nerfstudio.
 """
 
 from importlib import import_module
@@ -16,7 +16,7 @@ _PUBLIC = {
     "Scene": "query.scene",
     "Match": "query.match",
     "Found": "query.match",
-    "train": "open_scene",
+    "train": "training.fit",
     "reconstruct": "scene.reconstruct:reconstruct_scene",
     "things_of": "things.find",
     "rasterize": "rendering",

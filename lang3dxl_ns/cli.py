@@ -1,4 +1,4 @@
-"""The `lang3dxl` command: all tasks except training and rendering, which have the ns-* commands."""
+"""The `lang3dxl` command: all tasks except rendering and training with a viewer, which ns-* commands do."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import sys
 import threading
 from collections.abc import Iterator, Mapping, Sequence
 from contextvars import copy_context
-from dataclasses import make_dataclass
+from dataclasses import dataclass
 from difflib import get_close_matches
 from functools import reduce
 from importlib import import_module
@@ -22,7 +22,7 @@ import tyro
 
 from lang3dxl_ns.common.checks import disk_trouble
 from lang3dxl_ns.common.console import accept_any_console, silence_libraries
-from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.errors import NO_NERFSTUDIO, UserError, misses_nerfstudio
 from lang3dxl_ns.common.files import expanded
 from lang3dxl_ns.common.memory import ran_out_of_memory
 from lang3dxl_ns.common.settings_help import asked_for_all
@@ -37,14 +37,19 @@ BENCHMARKS = {
     "lerf-ovs": ("lab.benchmarks.published:LerfOvs", "LERF-OVS, beside the published figures."),
     "pt-ovs": ("lab.benchmarks.published:PtOvs", "PT-OVS, scene by scene."),
     "teaching": ("lab.benchmarks.teaching:TeachingBenchmark", "Words taught by example, beside the text."),
+<<<<<<< HEAD
+    "trust": ("lab.benchmarks.trust:TrustBenchmark", "Cautions under wrong answers, and under right ones."),
+=======
     "things": (
         "lab.benchmarks.things:ThingsBenchmark",
         "Single windows, portals, towers: F1, counts, boxes.",
     ),
+>>>>>>> things
     "attach": ("lab.benchmarks.attach:AttachBenchmark", "Words attached to a splat, beside its run's."),
 }
 COMMANDS = {
     "demo": ("lab.landmark.demo:Demo", "The full workflow in minutes, on a generated landmark."),
+    "train": ("commands.train:Train", "A scene from photos; a stopped run goes on."),
     "reconstruct": ("commands.prepare:Reconstruct", "COLMAP model from photos, or a video."),
     "prepare": ("commands.prepare:Prepare", "Make the targets that training learns from, in advance."),
     "attach": ("commands.attach:Attach", "Words for a splat that any program made: PLY, SPZ, checkpoints."),
@@ -89,7 +94,12 @@ def main(arguments: list[str] | None = None) -> None:
     except UserError as error:
         # Messages name the options of ns-train, which these two pass on; others have them without the prefix.
         prefix = "--" if words[0] in ("demo", "benchmark") else "--pipeline.datamanager."
-        sys.exit(f"Error: {str(error).replace(prefix, '--')}")
+        message = str(error).replace(prefix, "--")
+        sys.exit(f"Error: {message.replace('--pipeline.model.', '--') if words[0] == 'train' else message}")
+    except ModuleNotFoundError as error:
+        if not misses_nerfstudio(error):
+            raise
+        sys.exit(f"Error: {NO_NERFSTUDIO}")
     except BrokenPipeError:  # the reader closed the pipe, as in `lang3dxl … | head`
         _leave_output()
         sys.exit(1)
@@ -108,7 +118,7 @@ def main(arguments: list[str] | None = None) -> None:
         sys.exit(130)
 
 
-_TEXTS = "Texts follow --text: lang3dxl {} RUN --text windows --out {}"
+_TEXTS = "Texts follow --text: lang3dxl {} RUN --text windows{}"
 
 
 def _parsed(words: Sequence[str]) -> Any:
@@ -119,7 +129,7 @@ def _parsed(words: Sequence[str]) -> Any:
         parsed = tyro.cli(choice, args=words, description=__doc__, config=(tyro.conf.OmitArgPrefixes,))
     except SystemExit as error:
         if error.code == 2 and words[0] in ("query", "export"):
-            print(_TEXTS.format(words[0], "found" if words[0] == "query" else "found.ply"), file=sys.stderr)
+            print(_TEXTS.format(words[0], "" if words[0] == "query" else " --out found.ply"), file=sys.stderr)
         raise
     # Shells leave the ~ of --out=~/found as it is.
     vars(parsed).update({name: expanded(v) for name, v in vars(parsed).items() if isinstance(v, Path)})
@@ -144,11 +154,16 @@ def _leave_output() -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
+@dataclass
+class _NotCalled:
+    """Stands for a command that was not called."""
+
+
 def _choice(commands: Mapping[str, Any], words: Sequence[str]) -> Any:
     """Build tyro's type for a choice of subcommands. Only the called one is imported: most need torch."""
     kinds = []
     for name, (place, summary) in commands.items():
-        kind, described = make_dataclass("NotCalled", []), summary
+        kind, described = _NotCalled, summary
         if words[:1] == [name]:
             group = isinstance(place, Mapping)
             kind = _choice(place, words[1:]) if group else settings_of(place)

@@ -12,21 +12,19 @@ from nerfstudio.configs.base_config import LoggingConfig, MachineConfig, ViewerC
 from nerfstudio.plugins.types import MethodSpecification
 
 from lang3dxl_ns.common.settings_help import asked_for_all
-from lang3dxl_ns.plugin.optimizers import RunAdamConfig, RunScheduleConfig, parameter_groups
+from lang3dxl_ns.plugin.optimizers import parameter_groups
 from lang3dxl_ns.plugin.pipeline import Lang3DXLPipelineConfig
 from lang3dxl_ns.plugin.run_settings import check_command_line
 from lang3dxl_ns.plugin.trainer_config import Lang3DXLTrainerConfig
+from lang3dxl_ns.training.learning_rates import Rates, learning_rates, printed_learning_rates
+from lang3dxl_ns.training.settings import PRINTED_PHOTO_SCALE, as_printed
 
 check_command_line(sys.argv[1:])
 
 DEVICE: Literal["cuda", "cpu"] = "cuda" if torch.cuda.is_available() else "cpu"
 
-EXTENT = 1.1
-"""The published extent, 1.1 times the largest distance of a camera from the cameras' center. nerfstudio
-scales that distance to about 1."""
 
-
-def _config(method: str, iterations: int) -> Lang3DXLTrainerConfig:
+def _config(method: str, iterations: int, rates: Rates) -> Lang3DXLTrainerConfig:
     """Build the configuration of a method. `iterations` applies on a GPU."""
     return Lang3DXLTrainerConfig(
         method_name=method,
@@ -38,7 +36,7 @@ def _config(method: str, iterations: int) -> Lang3DXLTrainerConfig:
         steps_per_eval_image=500,
         steps_per_eval_all_images=0,
         pipeline=Lang3DXLPipelineConfig(),
-        optimizers=parameter_groups(),
+        optimizers=parameter_groups(rates),
         logging=LoggingConfig(profiler="none"),  # the profiler's table would end every command's output
         viewer=ViewerConfig(num_rays_per_chunk=1 << 15, websocket_host="127.0.0.1"),
         vis="viewer",
@@ -46,35 +44,15 @@ def _config(method: str, iterations: int) -> Lang3DXLTrainerConfig:
 
 
 def _paper_config() -> Lang3DXLTrainerConfig:
-    """Build the configuration of Lang3D-XL as printed or, where the paper is silent, as released;
-    docs/deviations.md lists where. The schedule of 70,000 iterations is scaled to the length of the run. Runs
-    of under 30,000 iterations use the learning rates for short runs."""
-    config = _config("lang3dxl-paper", 70_000)
-    x = 1 / 70_000
-    model, data, groups = config.pipeline.model, config.pipeline.datamanager, config.optimizers
-    model.decoder.name = "paper"
-    model.dense_weight = 0.5
-    model.feature_gradient_to_geometry, model.semantic_ramp = True, 15_000 * x
-    model.densify_from, model.densify_until, model.densify_every = 2_000 * x, 15_000 * x, 2_000 * x
-    model.densify_size_thresh = 0.2 * EXTENT
-    model.view_dependence, model.camera_optimization = "on", "off"
-    model.appearance.use, model.appearance.preset, model.appearance.opacity_shift = "on", "auto", True
-    model.codes_from = "auto"
-    data.scale_mode, data.pixel_distance, data.camera_res_scale_factor = "physical", "mean-inner", 0.5
-    data.regions, data.sam = "sam", "facebook/sam-vit-huge"
-    groups["means"] = {
-        "optimizer": RunAdamConfig(lr=1.6e-5 * EXTENT, short_lr=6.4e-4),
-        "scheduler": RunScheduleConfig(shape="log-linear", end=0.01, until=30_000 * x),
-    }
-    groups["codes"]["scheduler"].end = 0.01
-    groups["appearance"]["scheduler"].warm = 0.3
-    for name in ("field_encoding", "field_decoder", "downsampler"):
-        groups[name]["scheduler"].warm = 0.5
+    """Build the configuration of Lang3D-XL as printed; see `as_printed`."""
+    config = _config("lang3dxl-paper", 70_000, printed_learning_rates())
+    as_printed(config.pipeline.model, config.pipeline.datamanager)
+    config.pipeline.datamanager.camera_res_scale_factor = PRINTED_PHOTO_SCALE
     return config
 
 
 lang3dxl = MethodSpecification(
-    config=_config("lang3dxl", 30_000),
+    config=_config("lang3dxl", 30_000, learning_rates()),
     description="Lang3D-XL: language in large 3D scenes, from photo collections; on CUDA and on any CPU.",
 )
 lang3dxl_paper = MethodSpecification(

@@ -1,15 +1,17 @@
-"""`load_scene` and `train`: a scene from a scene file, from the folder of a run, or from photos."""
+"""`load_scene`: a scene from a scene file, or from the folder of a run."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
 import torch
 
 from lang3dxl_ns.common.console import silence_libraries
-from lang3dxl_ns.common.device import best_device
-from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.device import known_device
+from lang3dxl_ns.common.errors import NO_NERFSTUDIO, UserError, misses_nerfstudio
 from lang3dxl_ns.common.files import expanded
 from lang3dxl_ns.files.runs import OUTPUTS, find_config
 from lang3dxl_ns.files.scene_file import SUFFIX, Provenance, describe_scene_file, read_scene
@@ -42,56 +44,23 @@ def load_scene(
         encode_texts = None
         if clip is not None:
             about = replace(describe_scene_file(file)["scene"], clip=clip)
-            encode_texts = text_encoder(about, device or best_device())
+            encode_texts = text_encoder(about, known_device(device))
         return read_scene(file, device, settings, encode_texts)
     silence_libraries()  # nerfstudio's imports print warnings that a user can do nothing about
-    from lang3dxl_ns.plugin.load_scene import load_run
-
+    with _nerfstudio():
+        from lang3dxl_ns.plugin.load_scene import load_run
     return load_run(path, device, settings, clip)
 
 
-def train(
-    data: str | Path,
-    out: str | Path = "outputs",
-    *,
-    iterations: int | None = None,
-    clip: str | None = None,
-    dense: str | None = None,
-    scale: float | None = None,
-) -> Scene:
-    """Train a scene from photos, as `ns-train lang3dxl` does without a viewer, and return it.
-
-    Args:
-        data: folder of photos, with or without a COLMAP model or transforms.json, or a video.
-        out: folder for the run, in which NAME.scene is written.
-        iterations: training steps; by default 30,000 on a GPU and 3,000 without one.
-        clip: the CLIP that provides the language features: "builtin", a Hugging Face name, a folder, or
-            "none" to train colors only. The default is the one of `ns-train lang3dxl`.
-        dense: dense encoder, with the same choices.
-        scale: size of the photos that colors are trained on, as a fraction of the files' size.
-
-    Raises:
-        UserError: the photos cannot be used, or training was interrupted.
-    """
-    silence_libraries()
-    from lang3dxl_ns.methods import lang3dxl, run_config
-
-    usual = lang3dxl.config.pipeline.datamanager
-    models = clip or usual.clip, dense or usual.dense  # type: ignore[attr-defined]
-    steps = lang3dxl.config.max_num_iterations if iterations is None else iterations
-    config = run_config(Path(data), Path(out), expanded(data).resolve().stem, steps, *models)
-    if scale is not None:
-        config.pipeline.datamanager.camera_res_scale_factor = scale
-    config.set_timestamp()
-    config.save_config()
-    trainer = config.setup(local_rank=0, world_size=1)
-    trainer.setup()
+@contextmanager
+def _nerfstudio() -> Iterator[None]:
+    """Import what needs nerfstudio. Raises UserError if it is not installed."""
     try:
-        trainer.train()
-    except SystemExit as error:
-        stopped = f"training was stopped; to resume: ns-train with --load-dir {trainer.checkpoint_dir}"
-        raise UserError(stopped) from error
-    return load_scene(trainer.base_dir)
+        yield
+    except ModuleNotFoundError as error:
+        if not misses_nerfstudio(error):
+            raise
+        raise UserError(NO_NERFSTUDIO) from error
 
 
 def find_scene_file(path: str | Path | None = None) -> Path | None:

@@ -70,9 +70,11 @@ def imports_nerfstudio(path: Path) -> bool:
 
 
 def pytest_ignore_collect(collection_path: Path) -> bool | None:
-    """Without nerfstudio, files that import it are left out: `.ci/run` tests the base on a newer Python."""
-    is_python = collection_path.suffix == ".py" and not HAS_NERFSTUDIO
-    return True if is_python and imports_nerfstudio(collection_path) else None
+    """Without nerfstudio, tests of the plugin and files that import it are left out. `.ci/run` tests the base
+    so, on a newer Python."""
+    if HAS_NERFSTUDIO or collection_path.suffix != ".py":
+        return None
+    return True if "plugin" in collection_path.parts or imports_nerfstudio(collection_path) else None
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -85,6 +85,7 @@ def test_eight_threads_give_what_one_gives_from_one_pool():
 
 
 @pytest.mark.slow
+@pytest.mark.nerfstudio
 def test_words_are_learned_from_photos_of_12_megapixels_in_4_gigabytes(tmp_path, tiny_clip, tiny_dense):
     passes(of_large_photos, tmp_path, tiny_clip, tiny_dense)
 

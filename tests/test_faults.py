@@ -41,7 +41,7 @@ def parse(folder, **options):
     """What the dataparser finds: its photos by name."""
     parser = PhotoCollectionDataParserConfig(data=folder, **options).setup()
     parser.get_dataparser_outputs(split="train")
-    return {photo.name: photo for photo in parser.photos.values()}
+    return {photo.name: photo for photo in parser.capture.photos}
 
 
 def rename(folder, *names):

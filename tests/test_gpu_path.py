@@ -17,6 +17,10 @@ from scenes import write_scene
 from lab.baselines import BASELINES, langsplat
 from lang3dxl_ns.components.compression import CompressedField
 from lang3dxl_ns.open_scene import load_scene
+from lang3dxl_ns.training import gaussians
+from lang3dxl_ns.training.step import decoded_side
+
+pytestmark = pytest.mark.nerfstudio
 
 EVERYTHING = {
     "pipeline__model__decoder__name": "paper",
@@ -154,7 +158,7 @@ def test_code_maps_are_decoded_at_five_sizes(default):
     model = default.pipeline.model
     sizes = set()
     for model.step in range(200):
-        sizes.add(model.decoded_side)
+        sizes.add(decoded_side(model.run))
     assert len(sizes) == 5
     assert (min(sizes), max(sizes)) == model.config.decode_size
 
@@ -178,7 +182,7 @@ def test_a_cap_holds_and_the_least_opaque_go(trained):
     )
     model = trainer.pipeline.model
     assert model.num_points == 110
-    assert len(model.strategy_state["grad2d"]) == 110
+    assert len(model.run.statistics["grad2d"]) == 110
 
 
 def test_out_of_memory_ends_in_three_settings_that_help(trained, monkeypatch):
@@ -393,13 +397,13 @@ def test_numerics(gpu):
 
 def changed(model, change):
     """Lets every rendering, in training or not, have other opacities."""
-    activated = model.activated
+    activated = gaussians.activated
 
     def planted(g):
         shapes = activated(g)
         return replace(shapes, opacities=change(shapes))
 
-    model.activated = planted
+    gaussians.activated = planted
 
 
 def bug_tensor_on_the_cpu(model):
@@ -432,14 +436,14 @@ def bug_cpu_generator(model):
 )
 def test_planted_bugs_are_found(default, fake, monkeypatch, plant, error):
     model = default.pipeline.model
-    monkeypatch.setattr(model, "activated", model.activated)  # so that it is restored
+    monkeypatch.setattr(gaussians, "activated", gaussians.activated)  # so that it is restored
     plant(model)
     with fake_gpu(), pytest.raises((RuntimeError, TypeError), match=error):
         model.get_outputs_for_camera(default.pipeline.datamanager.train_dataset.cameras[0:1])
 
 
 def test_a_planted_wait_is_counted(default, monkeypatch, fake):
-    model, activated = default.pipeline.model.eval(), default.pipeline.model.activated
+    model, activated = default.pipeline.model.eval(), gaussians.activated
     camera = default.pipeline.datamanager.train_dataset.cameras[0:1]
 
     def impatient(g):
@@ -448,7 +452,7 @@ def test_a_planted_wait_is_counted(default, monkeypatch, fake):
 
     found = []
     for planted in (activated, impatient):
-        monkeypatch.setattr(model, "activated", planted)
+        monkeypatch.setattr(gaussians, "activated", planted)
         with fake_gpu() as gpu, gpu.counting() as waits:
             model.get_outputs_for_camera(camera)
         found.append(own(waits))

@@ -123,16 +123,15 @@ def test_map_coordinates_reach_the_scene_without_loss(tmp_path, offset):
     # And the transform that is saved still takes the model's own coordinates to the scene's.
     _, points, outputs = far
     original = outputs.metadata["original_points"]
-    rotation, shift = outputs.dataparser_transform.double().split([3, 1], dim=1)
-    again = outputs.dataparser_scale * (original @ rotation.T + shift[:, 0])
-    assert float((again - points).abs().max()) < 1e-6 * offset
+    again = torch.from_numpy(outputs.frame.points(original.numpy()))
+    assert float((again - points).abs().max()) < 1e-6
 
 
 def parse(folder, offset=None):
     """Cameras and seed points as the trainer gets them, of the model or of a copy moved by an offset."""
     parser = PhotoCollectionDataParserConfig(data=folder, load_3D_points=True).setup()
     if offset is not None:
-        model = parser.reconstruction
+        model = parser.capture.reconstruction
         photos = {
             name: replace(
                 photo,
@@ -146,9 +145,10 @@ def parse(folder, offset=None):
             )
             for name, photo in model.photos.items()
         }
-        parser.reconstruction = replace(model, photos=photos, points=model.points + offset)
+        moved = replace(model, photos=photos, points=model.points + offset)
+        parser.capture = replace(parser.capture, reconstruction=moved)
     outputs = parser.get_dataparser_outputs(split="train")
-    outputs.metadata["original_points"] = torch.from_numpy(parser.reconstruction.points)
+    outputs.metadata["original_points"] = torch.from_numpy(parser.capture.reconstruction.points)
     return outputs.cameras, outputs.metadata["points3D_xyz"], outputs
 
 

@@ -91,6 +91,70 @@ def test_a_planted_upward_import_is_found(source, room):
     assert faults(source, room)
 
 
+LAB_FROM = {"cli.py"}
+"""Files that name modules of `lab`, which is no part of the package."""
+NAMED = re.compile(r"(lab|commands)(\.\w+)+:\w+")
+
+
+def named_places(source: str) -> set[str]:
+    """Modules that a source reaches by strings, such as "lab.numerics.command:Numerics"."""
+    texts = (n.value for n in ast.walk(ast.parse(source)) if isinstance(n, ast.Constant))
+    return {text for text in texts if isinstance(text, str) and NAMED.fullmatch(text)}
+
+
+def test_strings_that_name_modules_lead_to_classes_and_only_the_command_line_names_the_lab():
+    for path in PACKAGE.rglob("*.py"):
+        for place in named_places(path.read_text()):
+            module, _, name = place.partition(":")
+            assert path.name in LAB_FROM, f"{path} reaches {place}"
+            root = PACKAGE.parent if module.startswith("lab.") else PACKAGE
+            tree = ast.parse((root / module.replace(".", "/")).with_suffix(".py").read_text()).body
+            classes = {node.name for node in tree if isinstance(node, ast.ClassDef)}
+            assigned = {ast.unparse(t) for node in tree if isinstance(node, ast.Assign) for t in node.targets}
+            assert name in classes | assigned, place
+
+
+def test_a_planted_string_is_found():
+    assert named_places("x = 'lab.landmark.demo:Demo'") == {"lab.landmark.demo:Demo"}
+    assert not named_places("x = 'a lab. with: text'")
+
+
+OWN = {"model", "pipeline", "scene", "trainer", "decoder", "splats", "camera", "config", "datamanager"}
+"""Names of parameters and fields that hold classes of this package or of nerfstudio."""
+STILL_ANY = {
+    *("plugin/conversation.py model", "plugin/panel.py pipeline", "plugin/trainer.py config"),
+    "plugin/inert_settings.py model",
+    *("preparation/encoders.py model", "preparation/families.py model"),  # models of transformers
+}
+"""The circles that are left."""
+
+
+def typed_any(source: str) -> set[str]:
+    """Names among `OWN` that are annotated Any."""
+    found = set()
+    for node in ast.walk(ast.parse(source)):
+        name = node.arg if isinstance(node, ast.arg) else None
+        if isinstance(node, ast.AnnAssign):
+            name = getattr(node.target, "id", getattr(node.target, "attr", None))
+        note = getattr(node, "annotation", None)
+        if name and name.strip("_") in OWN and isinstance(note, ast.Name) and note.id == "Any":
+            found.add(name.strip("_"))
+    return found
+
+
+def test_no_further_class_of_our_own_is_typed_any():
+    found = {
+        f"{path.relative_to(PACKAGE).as_posix()} {name}"
+        for path in PACKAGE.rglob("*.py")
+        for name in typed_any(path.read_text())
+    }
+    assert found <= STILL_ANY, found - STILL_ANY
+
+
+def test_a_planted_any_is_found():
+    assert typed_any("def f(model: Any, x: Any): ...\nclass A:\n    _scene: Any\n") == {"model", "scene"}
+
+
 def test_modules_that_import_each_other_do_not_exist():
     modules = {
         ".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts).removesuffix(".__init__"): path
@@ -150,6 +214,7 @@ assert all(getattr(lang3dxl_ns, name) is not None for name in lang3dxl_ns.__all_
 
 
 @pytest.mark.slow
+@pytest.mark.nerfstudio
 def test_the_entry_point_imports_no_heavy_library_and_other_methods_work_without_transformers(tmp_path):
     """nerfstudio's own imports aside, registering the method loads no transformers (which is missing here)
     and no pycolmap."""

@@ -2,18 +2,23 @@
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from painted_scene import painted_scene
 from PIL import Image
 
+from lang3dxl_ns.attachment.attach import attach
 from lang3dxl_ns.cli import main
+from lang3dxl_ns.common.device import known_device
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth
+from lang3dxl_ns.preparation.model_files import option_prefix, short_options, spoken
 from lang3dxl_ns.query.match import together
-from lang3dxl_ns.query.text import Prompt, parse_prompts
+from lang3dxl_ns.query.text import Prompt, caution, parse_prompts
 
 
 def report(path: Path, scene: str, layout: str = "plain", scored: bool = True) -> None:
@@ -137,6 +142,7 @@ def test_pooled_figures_that_are_no_numbers(value, tmp_path, monkeypatch):
         main(["evaluate", "pool", "--reports", "a.json", "--out", "report"])
 
 
+@pytest.mark.nerfstudio
 def test_ground_truth_that_is_no_folder():
     with pytest.raises(SystemExit, match="nope is not a folder"):
         main(["evaluate", "run", "none", "--ground-truth", "nope", "--out", "report"])
@@ -173,11 +179,48 @@ def test_python_calls_with_anything_else_name_what_was_expected(value):
 
 
 @pytest.mark.parametrize("typed", ["rose window not door", "‘window’ not door", "a NOT 'b'"])
-def test_a_not_without_quotes_is_told_of(typed, capsys):
+def test_a_not_without_quotes_is_told_of_with_the_answer_not_by_parsing(typed, capsys):
     (prompt,) = parse_prompts(typed)
     assert prompt.negatives == () and "not" in prompt.text.lower()
-    assert "To tell one thing from another" in capsys.readouterr().out
+    assert "To tell one thing from another" in caution(prompt.text)
+    assert caution("knot pattern") is None and "to tell" not in (caution("nothing") or "")
     assert parse_prompts("‘window’ not ‘door’")[0].negatives == ("door",)
     assert parse_prompts('"window" not "door"')[0].negatives == ("door",)
     assert parse_prompts("the king’s door")[0].text == "the king’s door"
     assert not capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    "typed", ["a" + " " * 32_000 + "b", "not" * 20_000, '"' * 30_001, "‘" * 30_000 + "b"]
+)
+def test_long_prompts_are_parsed_in_a_moment(typed):
+    """Quadratic patterns took 40 s for the first of these, whose single spaces are one."""
+    assert len(parse_prompts(typed + "x")) == 1
+
+
+def test_pictures_of_views_through_other_lenses_are_not_drawn_over_each_other():
+    scene = painted_scene()
+    place = scene.camera("0003", 48)
+    wider = replace(place, intrinsics=place.intrinsics * torch.tensor([[0.5], [0.5], [1.0]]))
+    matches = [scene.query("dome", camera) for camera in (place, wider)]
+    with pytest.raises(UserError, match="one picture shows the prompts of one view"):
+        together(matches)
+    assert together([matches[0], scene.query("window", place)]).shape[1] == 48
+
+
+@pytest.mark.parametrize("device", ["nodev", -1, "mps", "cuda", "cuda:77"])
+def test_a_device_that_is_not_there_is_told(device, tmp_path):
+    if device == "cuda" and torch.cuda.is_available():
+        pytest.skip("it is there")
+    with pytest.raises(UserError, match=r"give cpu|this machine has"):
+        known_device(device)
+    assert known_device("cpu") == torch.device("cpu")
+
+
+def test_calling_attach_leaves_the_options_of_later_messages(tmp_path):
+    before = option_prefix.get()
+    with pytest.raises(UserError):
+        attach(tmp_path / "none.ply", out=tmp_path / "a.scene")
+    with short_options():
+        assert spoken("--pipeline.datamanager.clip") == "--clip"
+    assert option_prefix.get() == before

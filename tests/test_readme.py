@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from processes import output
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.nerfstudio]
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()

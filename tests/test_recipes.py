@@ -10,6 +10,8 @@ from PIL import Image
 
 import lang3dxl_ns.open_scene as opening
 
+pytestmark = pytest.mark.nerfstudio
+
 PAGE = (Path(__file__).parents[1] / "docs" / "python.md").read_text()
 RECIPES = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
 

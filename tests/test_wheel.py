@@ -9,10 +9,12 @@ import zipfile
 from pathlib import Path
 
 import pytest
-from build import ProjectBuilder
-from build.env import DefaultIsolatedEnv
 from filelock import FileLock
 from scenes import write_scene
+
+pytest.importorskip("build")
+from build import ProjectBuilder
+from build.env import DefaultIsolatedEnv
 
 ROOT = Path(__file__).parents[1]
 pytestmark = pytest.mark.slow

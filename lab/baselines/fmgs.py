@@ -46,7 +46,7 @@ class PlaceField(Decoder):
         self.center.copy_(center)
         self.radius.fill_(radius)
 
-    def carried(self, gaussians: Mapping[str, Tensor]) -> Float[Tensor, "n d"]:
+    def carried(self, gaussians: Mapping[str, Tensor] | nn.ParameterDict) -> Float[Tensor, "n d"]:
         """Decode the features at the Gaussians' positions; positions get no gradient."""
         places = _STRETCH * (gaussians["means"].detach() - self.center) / self.radius
         clip, dense = self.field(places)

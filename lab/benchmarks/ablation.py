@@ -68,7 +68,7 @@ class Ablation:
     """Number of concurrent runs. They slow each other down, so keep 1 if times matter."""
 
     def main(self) -> None:
-        from lang3dxl_ns.plugin.model_config import SHORT_FIELD_RUN
+        from lang3dxl_ns.training.settings import SHORT_FIELD_RUN
 
         made = self.scene or landmark_scenes(
             self.landmarks, self.out / "scenes", self.photos, self.test_views

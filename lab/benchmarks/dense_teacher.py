@@ -23,7 +23,6 @@ import torch
 import torch.nn.functional as F
 import tyro
 from jaxtyping import Float
-from lang3dxl_ns.preparation.photo_collection import read_collection
 from PIL import Image
 from torch import Tensor
 
@@ -50,6 +49,7 @@ from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.rendering import composite
 from lang3dxl_ns.rendering.gathering import Pixels, gather
 from lang3dxl_ns.scene.camera import resized
+from lang3dxl_ns.scene.capture import open_capture
 from lang3dxl_ns.scene.record import ScenePhoto
 from lang3dxl_ns.training.learn_codes import DENSE_AXES
 from lang3dxl_ns.training.sharpening import sharpen
@@ -176,7 +176,7 @@ class Gathering:
     @classmethod
     def of(cls, run: Path, scene: Scene) -> Gathering:
         photos = {photo.name: photo for photo in scene.photos if photo.split == "train"}
-        collection = read_collection(run / "scene")
+        collection = open_capture(run / "scene")
         collection = replace(collection, photos=[p for p in collection.photos if p.name in photos])
         config = settled(PreparationConfig(clip="builtin"))
         _, targets = prepare_photos(collection, config, run / "scene" / "lang3dxl_cache", "cpu")

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from rich import get_console
 from rich.markdown import Markdown
 
+from lab.landmark.picture import CAPTION
 from lab.reports import command_line, with_flags
 from lab.stages import MeasuredStages
 from lang3dxl_ns.common.checks import check_numbers
@@ -113,10 +114,15 @@ class Demo:
 
             draw_picture(most_telling(rows, 3), folder / "report.png")
         get_console().print(Markdown(self.markdown(report)))
-        say(f"\nReport and picture: {folder / 'report.md'}, {folder / 'report.png'}")
+        say(f"\nReport: {folder / 'report.md'}. Picture: {folder / 'report.png'} ({CAPTION})")
         run = shlex.quote(os.path.relpath(out))
-        say(f"Walk through it: lang3dxl view {run}")
-        say(f'Ask it:          lang3dxl query {run} --text "windows" --out found')
+        say(
+            "Next:",
+            f"  walk through it  lang3dxl view {run}",
+            f'  ask it           lang3dxl query {run} --text "windows" --out found',
+            f"  share it         lang3dxl export {run} --web page",
+            "  your own photos  ns-train lang3dxl --data FOLDER",
+        )
 
     def _folder(self) -> Path:
         """Return the requested folder, or the first default one without another scene. Raises UserError if

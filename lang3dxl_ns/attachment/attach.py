@@ -15,13 +15,13 @@ from lang3dxl_ns.attachment.learn import learn, prepare_photos, scene_file, sett
 from lang3dxl_ns.attachment.segment import segmented
 from lang3dxl_ns.attachment.views import rendered_views
 from lang3dxl_ns.common.console import say, some
-from lang3dxl_ns.common.device import best_device
+from lang3dxl_ns.common.device import known_device
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import expanded, make_folder
 from lang3dxl_ns.common.stages import Stages
 from lang3dxl_ns.files.read_splats import find_splats, read_splats
 from lang3dxl_ns.files.scene_file import Provenance, check_scene_name, replace_scene
-from lang3dxl_ns.preparation.model_files import check_encoders, option_prefix
+from lang3dxl_ns.preparation.model_files import check_encoders, short_options
 from lang3dxl_ns.preparation.segmentation import find_text_segmenter, load_text_segmenter
 from lang3dxl_ns.query.match import save_picture
 from lang3dxl_ns.query.scene import Scene
@@ -39,6 +39,7 @@ _NEAREST = 1.2e-4
 _SHARES = {"splat": 0.05, "frame": 0.15, "prepare": 0.5, "learn": 0.3}
 
 
+@short_options()
 def attach(
     splat: str | Path,
     data: str | Path | None = None,
@@ -74,7 +75,7 @@ def attach(
         if not os.access(place.parent, os.W_OK):
             raise UserError(f"{place.parent} is read-only: choose another place, or change its permissions")
     stages = Stages(_SHARES | {"segment": 0.3} if config.segment else _SHARES)
-    worker = torch.device(device or best_device())
+    worker = known_device(device)
     with stages.stage("splat"):  # a damaged one is refused before any model is downloaded
         splats = read_splats(path).to(worker)
         middle = splats.means.median(0).values
@@ -86,7 +87,6 @@ def attach(
                 "again, larger, or without the offset of map coordinates"
             )
         say(f"{path}: {splats}")
-    option_prefix.set("--")
     preparation = settled(config)
     check_encoders(preparation.clip, preparation.dense)
     found = find_text_segmenter(preparation.foreground_model, preparation.sam) if config.segment else None
@@ -124,6 +124,9 @@ def attach(
         made = f"attached to {path.name} from {len(collection.photos)} {what}"
         scene, written = replace_scene(place, scene, Provenance(title=place.stem, made_how=made))
         say(f"Wrote {written / 1e6:.1f} MB to {place}")
+        if data is None:
+            kept = sum(file.stat().st_size for file in collection.folder.rglob("*") if file.is_file())
+            say(f"{collection.folder} keeps the views ({kept / 1e6:.0f} MB): delete it if you are done")
     return scene
 
 

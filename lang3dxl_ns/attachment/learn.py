@@ -105,7 +105,7 @@ def scene_file(
     return SceneRecord(
         photos=photos,
         clip=known.address,
-        clip_identity=known.identity,
+        clip_identity=known.clip_identity,
         scale=scale,
         transform=(similarity[:3] / scale).tolist(),
         data=str(collection.folder),

@@ -12,30 +12,27 @@ from pathlib import Path
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 from jaxtyping import Float
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from lang3dxl_ns.attachment import Up
+from lang3dxl_ns.attachment import direction_of
+from lang3dxl_ns.attachment.upright import BACKGROUND, CERTAIN, find_up, name_of_axis
 from lang3dxl_ns.common.console import say, tracked
 from lang3dxl_ns.common.errors import DAMAGE, UserError
-from lang3dxl_ns.common.files import make_folder, read_json, write_atomically
+from lang3dxl_ns.common.files import make_folder, read_json, replace_file
 from lang3dxl_ns.query.match import as_bytes, save_picture
 from lang3dxl_ns.query.visibility import fingerprint
 from lang3dxl_ns.rendering import Rendering, Splats, composite, render
 from lang3dxl_ns.rendering.gathering import filled_pixels
-from lang3dxl_ns.rendering.projection import rotations
-from lang3dxl_ns.scene.camera import Camera, Lens, resized
+from lang3dxl_ns.scene.camera import Camera, Lens, level, looking, resized
 from lang3dxl_ns.scene.capture import Capture
 from lang3dxl_ns.scene.colmap import Reconstruction, TrackedPhoto
 from lang3dxl_ns.scene.photo import Photo
 
 LENS = Lens(480, 360, 384.0, 384.0, 240.0, 180.0)
 """Lens of the views, 64 degrees wide like a phone's."""
-BACKGROUND = (0.75, 0.8, 0.85)
-"""Color behind the splat, a pale sky."""
-_RULE = 3
+_RULE = 4
 """Version of the rule. It is increased when views are chosen or rendered in another way."""
 _OPAQUE = 0.3
 _NEAR = 0.03
@@ -49,8 +46,6 @@ _BLURRED = 2.0
 """Median size of a view's Gaussians, relative to the median view's, above which it is taken too close."""
 _PROBES, _ROOFED = 64, 0.7
 """Number of places tried, and the share of them with matter above from which a scene is indoors."""
-_TILT = 0.4
-"""Largest angle between up and the nearest axis, radians."""
 _RING = (1.6, 5.0)
 """Distances of the views around a scene, in radii. From closer by, its parts fill a view, and their crops
 lack the surroundings by which CLIP distinguishes them."""
@@ -78,14 +73,14 @@ class Extent:
     """Height of the ground above the center, along `up`."""
 
     @classmethod
-    def of(cls, splats: Splats, up: Up) -> Extent:
+    def of(cls, splats: Splats, up: str) -> Extent:
         """Measure the extent. Raises UserError if there is no matter."""
         solid = solids(splats)
         center = solid.means.median(0).values
         places = solid.means - center
         distance = places.norm(dim=1)
         radius = float(distance.quantile(0.75))
-        direction = find_up(solid, center, radius) if up == "auto" else _axis(up).to(places)
+        direction = _found_up(solid, center, radius) if up == "auto" else places.new_tensor(direction_of(up))
         near = places[distance < 1.5 * radius]
         return cls(center, radius, direction, float((near @ direction).quantile(0.05)))
 
@@ -98,41 +93,25 @@ def solids(splats: Splats) -> Splats:
     return splats.select(rows[:: -(-len(rows) // 200_000)])
 
 
-def find_up(solid: Splats, center: Float[Tensor, "3"], radius: float) -> Float[Tensor, "3"]:
-    """Find up, near one of the axes: the ground is the largest of all flat things at an end of the scene."""
-    solid = solid.select((solid.means - center).norm(dim=1) < 4 * radius)
-    (normals, area), places = _normals(solid), solid.means - center
-    best, direction = -math.inf, _axis("z").to(normals)
-    for name in ("z", "-z", "y", "-y", "x", "-x"):
-        cosines = normals @ _axis(name).to(normals)
-        facing = cosines.abs() > math.cos(_TILT)
-        if not facing.any():
-            continue
-        turned = normals[facing] * cosines[facing].sign()[:, None]
-        own = F.normalize((turned * area[facing, None]).sum(0), dim=0)
-        heights = places @ own
-        ground = (heights - heights.quantile(0.03)).abs() < 0.15 * radius
-        score = float(area[ground & ((normals @ own).abs() > math.cos(0.3))].sum())
-        if score > best:
-            best, direction = score, own
-    return direction
+def _found_up(solid: Splats, center: Float[Tensor, "3"], radius: float) -> Float[Tensor, "3"]:
+    """Find the up direction, and say what was found, how certainly, and how to change it."""
+    found = find_up(solid, center, radius)
+    name, other = (f"{name_of_axis(way)} ({_numbers(way)})" for way in (found.direction, found.second))
+    if found.margin >= CERTAIN:
+        say(f"up is about {name}, by a margin of {found.margin:.1f}; --up sets another direction")
+    else:
+        say(
+            f"which way is up is doubtful: {name} leads {other} by only {found.margin:.1f}. If the views "
+            f"aren't upright, set --up={_numbers(found.second)}"
+        )
+    return found.direction
 
 
-def _normals(solid: Splats) -> tuple[Float[Tensor, "n 3"], Float[Tensor, " n"]]:
-    """Return each Gaussian's thinnest axis, and the area of the other two, clamped at the 99th percentile."""
-    thin = solid.scales.argmin(1)
-    normals = rotations(solid.quats)[torch.arange(len(solid), device=thin.device), :, thin]
-    area = solid.scales.prod(1) / solid.scales.amin(1).clamp_min(1e-12)
-    return normals, area.clamp_max(float(area.quantile(0.99)))
+def _numbers(direction: Float[Tensor, "3"]) -> str:
+    return ",".join(f"{value:.2f}" for value in direction.tolist())
 
 
-def _axis(name: str) -> Float[Tensor, "3"]:
-    axis = torch.zeros(3)
-    axis["xyz".index(name[-1])] = -1.0 if name.startswith("-") else 1.0
-    return axis
-
-
-def rendered_views(splats: Splats, count: int, up: Up, folder: Path) -> Capture:
+def rendered_views(splats: Splats, count: int, up: str, folder: Path) -> Capture:
     """Render this many pictures of a splat as a photo collection, in the splat's frame. They are kept in
     `folder`, and rendered again only for another splat or other settings. Raises UserError if no view shows
     the splat well."""
@@ -153,7 +132,7 @@ def rendered_views(splats: Splats, count: int, up: Up, folder: Path) -> Capture:
             save_picture(as_bytes(view.rgb), path)
         seen[name] = _tracked(name, view, chosen)
     content = {"of": stamp, "views": [camera.view_matrix.tolist() for camera in cameras]}
-    write_atomically(folder / "views.json", json.dumps(content))
+    replace_file(folder / "views.json", json.dumps(content))
     photos = [Photo(name, folder / "images" / name, None, LENS) for name in names]
     points = np.concatenate([photo.points for photo in seen.values()])
     reconstruction = Reconstruction(seen, points, np.zeros(points.shape, np.uint8))
@@ -255,7 +234,7 @@ class _FreeSpace:
         self._extent, self._margin = extent, _NEAR * extent.radius
         self._tree = KDTree(solid.means.cpu().numpy())
         self._reach = solid.scales.amax(1).clamp_max(0.2 * extent.radius).cpu().numpy()
-        self._plan = torch.stack([_level(extent.up), _level(extent.up, 0.25)], dim=1)
+        self._plan = torch.stack([level(extent.up), level(extent.up, 0.25)], dim=1)
         self._from_above = KDTree((solid.means @ self._plan).cpu().numpy())
         self._heights = (solid.means @ extent.up).cpu().numpy()
         self._width = 2 * (self._margin + float(np.median(self._reach)))
@@ -291,7 +270,7 @@ def _around(extent: Extent, draw: torch.Generator) -> tuple[Float[Tensor, "3"], 
     angle, height, distance, *aim = torch.rand(6, generator=draw).tolist()
     elevation = math.radians(40) * height**2
     away = extent.radius * _RING[0] * (_RING[1] / _RING[0]) ** distance
-    direction = _level(extent.up, angle)
+    direction = level(extent.up, angle)
     floor = extent.center + (extent.ground + 0.08 * extent.radius) * extent.up
     place = floor + away * (math.cos(elevation) * direction + math.sin(elevation) * extent.up)
     offset = torch.tensor([2 * value - 1 for value in aim]).to(place)
@@ -301,27 +280,7 @@ def _around(extent: Extent, draw: torch.Generator) -> tuple[Float[Tensor, "3"], 
 def _inside(extent: Extent, draw: torch.Generator) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
     """Draw a place within a radius, a person's or a story's height above the ground, and a target around."""
     x, y, height, angle, tilt = torch.rand(5, generator=draw).tolist()
-    side, front = _level(extent.up), _level(extent.up, 0.25)
+    side, front = level(extent.up), level(extent.up, 0.25)
     place = extent.center + extent.radius * ((2 * x - 1) * side + (2 * y - 1) * front)
     place = place + (extent.ground + extent.radius * (0.08 + 0.4 * height**2)) * extent.up
-    return place, place + _level(extent.up, angle) + (0.5 * tilt - 0.15) * extent.up
-
-
-def _level(up: Float[Tensor, "3"], turn: float = 0.0) -> Float[Tensor, "3"]:
-    """Return the direction along the ground at a fraction of a full turn."""
-    first = F.one_hot(up.abs().argmin(), 3).to(up)
-    side = F.normalize(torch.linalg.cross(up, first), dim=0)
-    return math.cos(2 * math.pi * turn) * side + math.sin(2 * math.pi * turn) * torch.linalg.cross(up, side)
-
-
-def looking(
-    place: Float[Tensor, "3"], target: Float[Tensor, "3"], up: Float[Tensor, "3"]
-) -> Float[Tensor, "4 4"]:
-    """Build an upright camera's view matrix (world → camera, OpenCV axes) from its place and its target."""
-    forward = F.normalize(target - place, dim=0)
-    right = F.normalize(torch.linalg.cross(forward, up), dim=0)
-    down = torch.linalg.cross(forward, right)
-    view = torch.eye(4)
-    view[:3, :3] = torch.stack([right, down, forward])
-    view[:3, 3] = -view[:3, :3] @ place
-    return view
+    return place, place + level(extent.up, angle) + (0.5 * tilt - 0.15) * extent.up

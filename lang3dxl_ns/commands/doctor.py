@@ -10,6 +10,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from glob import glob
 from importlib.metadata import PackageNotFoundError, requires, version
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Literal
 
@@ -93,10 +94,13 @@ def versions() -> Iterator[Finding]:
     """Check Python and the required packages, pycolmap among them, against this package's requirements."""
     from packaging.requirements import Requirement
 
-    fine, remedy = (3, 10) <= sys.version_info[:2] < (3, 13), "make an environment of 3.10, 3.11 or 3.12"
+    fine, remedy = sys.version_info[:2] >= (3, 10), "make an environment of Python 3.10 or later"
     yield Finding("Python", sys.version.split()[0], fine, remedy, "problem")
+    whole = find_spec("nerfstudio") is not None
+    yield Finding("nerfstudio", *_nerfstudio_half(whole))
     for need in (Requirement(line) for line in requires("lang3dxl-ns") or []):
-        if need.marker is not None:
+        extra = "nerfstudio" if whole else ""
+        if need.marker is not None and not need.marker.evaluate({"extra": extra}):
             continue
         found = ""
         with suppress(PackageNotFoundError):
@@ -104,6 +108,18 @@ def versions() -> Iterator[Finding]:
         good = found != "" and need.specifier.contains(found.partition("+")[0], prereleases=True)
         remedy = f"pip install '{need.name}{need.specifier}'"
         yield Finding(need.name, found or "not installed", good, remedy, "problem")
+
+
+def _nerfstudio_half(installed: bool) -> tuple[str, bool, str]:
+    """Say whether nerfstudio is there and, if not, whether it can be."""
+    if installed:
+        return "installed: ns-train, ns-eval, and its viewer work", True, ""
+    base = "not installed: demo, training, asking, attaching and the page work without it"
+    if sys.version_info[:2] >= (3, 13):
+        python = f"{sys.version_info[0]}.{sys.version_info[1]}"
+        remedy = f"for ns-train: an environment of Python 3.10 to 3.12 (it pins what {python} lacks)"
+        return base, False, remedy
+    return base, False, "for ns-train: pip install -e '.[nerfstudio]' in the checkout"
 
 
 def devices() -> Iterator[Finding]:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import tyro
 
-from lang3dxl_ns.common.console import some
+from lang3dxl_ns.common.console import say, some
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import read_names, write_atomically
 from lang3dxl_ns.common.reports import describe_machine, write_report
@@ -101,6 +102,10 @@ class EvaluateRun(_Scored):
         if self.ground_truth is not None or self.layout != "auto":
             pipeline.config.ground_truth_layout = self.layout
         results = pipeline.evaluation.scored(get_std=True)
+        if taught := _taught_beside(place):
+            results["protocol"]["taught_words_left_out"] = taught
+            words = ", ".join(taught)
+            say(f"Scored by text alone: what examples taught ({words}) counts where the .scene file is named")
         write_scores(self.out, self.scene or pipeline.datamanager.data_folder.name, results, pipeline.device)
 
     def _score_scene(self, place: Path) -> None:
@@ -180,6 +185,17 @@ Evaluate = (
     | Annotated[EvaluatePool, tyro.conf.subcommand("pool")]
     | Annotated[EvaluateSplit, tyro.conf.subcommand("split")]
 )
+
+
+def _taught_beside(run: Path) -> list[str]:
+    """List the words that the scene files in a run's folder were taught."""
+    from lang3dxl_ns.files.scene_file import describe_scene_file
+
+    taught: list[str] = []
+    for file in sorted((run if run.is_dir() else run.parent).glob("[!.]*.scene")):
+        with suppress(UserError):  # a damaged one has no say in the run's figures
+            taught += [word.name for word in describe_scene_file(file)["taught"]]
+    return taught
 
 
 def _told(name: str, protocol: dict[str, Any]) -> str:

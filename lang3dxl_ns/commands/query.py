@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import shlex
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from typing import Annotated, Any
 
@@ -16,18 +16,19 @@ from numpy import ndarray as Array
 from PIL import Image
 from scipy.ndimage import find_objects, label
 
+from lang3dxl_ns.common.checks import expect
 from lang3dxl_ns.common.console import say, some, tracked
-from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.common.files import make_folder, read_names, slugs, write_atomically
+from lang3dxl_ns.common.errors import UserError, readable
+from lang3dxl_ns.common.files import make_folder, read_json, read_names, replace_file, slugs, write_atomically
 from lang3dxl_ns.common.settings_help import showing
 from lang3dxl_ns.files.scene_file import Provenance, check_scene_name, replace_scene
 from lang3dxl_ns.files.splat_file import check_splat_name
 from lang3dxl_ns.open_scene import load_scene, provenance_of
-from lang3dxl_ns.query.doubt import doubtful
 from lang3dxl_ns.query.match import save_picture, together
 from lang3dxl_ns.query.question import QueryConfig, Question
 from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.query.text import Prompt, caution, listed_phrases, parse_prompts
+from lang3dxl_ns.query.trust import Trust
 from lang3dxl_ns.query.vocabulary import whole_words
 from lang3dxl_ns.scene.camera import Camera
 from lang3dxl_ns.scene.camera_path import read_camera_path
@@ -39,7 +40,7 @@ _LEAST_PART = 1e-4
 _NEAREST = Image.Resampling.NEAREST
 _READ_BY: dict[str, tuple[str, ...]] = dict.fromkeys(("title", "credit", "license"), ("web", "scene_file"))
 _READ_BY |= dict.fromkeys(("text", "not_", "look"), ("out", "web"))
-_READ_BY |= {"vocabulary": ("web",), "photos": ("web",), "all": ("out",)}
+_READ_BY |= {"vocabulary": ("web",), "photos": ("web",), "all": ("out",), "hide_floaters": ("out", "web")}
 """Targets of `export` that read an option. Options that are not listed are read by every target."""
 _Not = Annotated[tyro.conf.UseAppendAction[list[str]], tyro.conf.arg(name="not")]
 
@@ -61,7 +62,7 @@ class Query:
     """Text to search for, such as '"windows" not "arcades"'. Repeat the flag, or separate texts with `;`."""
     not_: _Not = field(default_factory=list)
     """Negative for all texts, such as arcades. Repeat the flag for more."""
-    out: Path
+    out: Path = Path("found")
     """Folder for the results."""
     image: str | None = None
     """Use the view of this photo, by name."""
@@ -82,6 +83,9 @@ class Query:
             raise UserError("--coco labels all photos: give --all too")
         if self.coco is not None and (self.coco.suffix != ".json" or self.coco.is_dir()):
             raise UserError(f"--coco writes labels as JSON: {self.coco} is not the name of a .json file")
+        if self.coco is not None and self.coco.is_file() and self.coco.stat().st_size:
+            with readable(f"{self.coco} is another file than one of labels", "choose another name"):
+                expect({"images", "annotations"} <= {*read_json(self.coco, 1 << 31)}, "it has no annotations")
         if sum((self.image is not None, self.all, self.camera_path is not None)) > 1:
             raise UserError("--image, --all and --camera-path exclude each other: give one of them")
         prompts = parse_texts(self.text, self.not_)  # fail now rather than after the work
@@ -119,15 +123,16 @@ class Query:
             views.append({"view": name, **seconds, "matches": found})
         if self.coco is not None:
             write_atomically(self.coco, json.dumps(labels.content) + "\n")
-        texts = list(zip(prompts, question.doubts, question.thresholds, folders, strict=True))
-        report = {"texts": [_text_report(scene, *text) for text in texts], "views": views}
-        write_atomically(listed, json.dumps(report, indent=2, ensure_ascii=False) + "\n")
-        for (prompt, doubt, _, folder), (matches_there, score, where) in zip(texts, best, strict=True):
+        texts = list(zip(prompts, question.trusts, question.thresholds, folders, strict=True))
+        reports = zip(question.doubts, texts, strict=True)
+        report = {"texts": [_text_report(scene, d, *text) for d, text in reports], "views": views}
+        replace_file(listed, json.dumps(report, indent=2, ensure_ascii=False) + "\n")
+        for (prompt, trust, _, folder), (matches_there, score, where) in zip(texts, best, strict=True):
             taught = prompt.taught is not None
             closest = "" if matches_there else " (no match; this view comes closest)"
             say(f"{prompt.text}{' (taught)' if taught else ''}: {score:.2f} at {where}; {folder}{closest}")
-            warnings = (None if taught else caution(prompt.text), doubtful(prompt.text, doubt, taught))
-            say(*(f"  {advice}" for advice in warnings if advice))
+            advice = None if taught else caution(prompt.text)
+            say(*(f"  {line}" for line in (advice, str(trust)) if line))
         ours = [*self.out.glob("*/*.npy"), *shared.glob("*.png")]  # a user may have other folders there
         if old := sorted({path.parent.name for path in ours if path.lstat().st_mtime_ns <= before}):
             say(f"{self.out} still has files of an earlier query, not listed in query.json: {some(old)}")
@@ -209,10 +214,13 @@ def file_names(photos: list[str]) -> list[str]:
     return [n if names.count(n) == 1 else f"{n}-{i + 1}" for i, n in enumerate(names)]
 
 
-def _text_report(scene: Scene, prompt: Prompt, doubt: float, threshold: float, folder: Path) -> dict:
+def _text_report(
+    scene: Scene, doubt: float, prompt: Prompt, trust: Trust, threshold: float, folder: Path
+) -> dict[str, Any]:
     taught, synonyms = prompt.taught is not None, scene.synonyms(prompt)
     told = {"text": prompt.text, "negatives": list(prompt.negatives), "synonyms": synonyms, "taught": taught}
-    return told | {"doubt": doubt, "threshold": threshold, "folder": folder.name}
+    told |= {"doubt": doubt, "trust": asdict(trust)}
+    return told | {"threshold": threshold, "folder": folder.name}
 
 
 @showing(
@@ -249,6 +257,8 @@ class Export:
     """Terms under which photos and scene may be used."""
     all: bool = False
     """Write all Gaussians. With --text, a .ply has their relevancy as a property."""
+    hide_floaters: bool = False
+    """Leave out Gaussians that float where no surface is, and the sky's. A page opens with them hidden."""
     index: Path | None = None
     """File (.npy or .txt) for the indices of the matching Gaussians, in the order of the scene, which is also
     the order of the splat that it was attached to. It needs --text and --out."""
@@ -288,6 +298,7 @@ class Export:
             own = read_names(self.vocabulary, "words") if self.vocabulary else ()
             words = self._clip_words(scene.file.clip)
             page = Page(scene, prompts, own, words, self._told(), self.look, self.photos)
+            page.hide_floaters = self.hide_floaters
             size = write_page(page, self.web)
             for left_out in page.left_out:
                 say(f"{left_out}.")
@@ -295,7 +306,14 @@ class Export:
             say(f"Wrote {size / 1e6:.1f} MB to {self.web}; see it: {see}")
         if self.out is not None:
             text = prompts[0] if prompts else None
-            count = scene.export(self.out, text, everything=self.all, look=self.look, index=self.index)
+            count = scene.export(
+                self.out,
+                text,
+                everything=self.all,
+                look=self.look,
+                index=self.index,
+                hide_floaters=self.hide_floaters,
+            )
             say(f"Wrote {count} of {len(scene.splats)} Gaussians to {self.out}")
 
     def _clip_words(self, clip: str | None) -> tuple[str, ...]:

@@ -11,7 +11,7 @@ import tyro
 
 from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.common.files import locked
+from lang3dxl_ns.common.files import file_locked
 
 if TYPE_CHECKING:
     from lang3dxl_ns.query.scene import Scene
@@ -50,7 +50,7 @@ class Teach:
 
         file, name = existing_scene_file(self.scene).resolve(), known_word(self.word)
         example = self._example()
-        with locked(file.parent):  # another example that is taught at this moment comes first, or waits
+        with file_locked(file):  # another example that is taught at this moment comes first, or waits
             scene = load_scene(file, clip=self.clip)
             before = scene.words[name].examples if name in scene.words else ()
             taught = scene.teach(self.word, [*before, example])
@@ -110,7 +110,7 @@ class Words:
         if self.forget or self.load is not None:
             changed = {name: scene.words.get(name) for name in {**before, **scene.words}}
             changed = {name: word for name, word in changed.items() if word is not before.get(name)}
-            with locked(file.resolve().parent):
+            with file_locked(file):
                 for word in describe_scene_file(file)["taught"]:
                     name = known_word(word.name)
                     if name in changed and (name not in before or word.to_json() != before[name].to_json()):
@@ -131,7 +131,7 @@ def forgotten(scene: Scene, which: str) -> Scene:
     from lang3dxl_ns.words.taught_words import known_word
 
     name, _, number = which.rpartition("/")
-    if known_word(which) in scene.words or not number.isdecimal():
+    if known_word(which) in scene.words or not (number.isdecimal() and len(number) < 10):
         name, number = which, ""
     word = scene.words.get(known_word(name))
     if word is None or (number and not 1 <= int(number) <= len(word.examples)):

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import os
+import sys
+import webbrowser
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -13,7 +16,7 @@ from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.settings_help import showing
 
 
-@showing("scene", "text", "photos", "host", "port", "clip")
+@showing("scene", "text", "photos", "host", "port", "browser", "clip")
 @dataclass(kw_only=True)
 class View:
     """Explore and query a scene in a browser.
@@ -32,6 +35,8 @@ class View:
     """Address to serve at. 0.0.0.0 opens it to the network, with the token shown in the terminal."""
     port: int | None = None
     """Port to serve at. The default is a free one from 7007 on."""
+    browser: bool = True
+    """Open the page in a browser, on a machine with a desktop (--no-browser: only print the address)."""
     clip: str | None = None
     """Name or folder of the scene's CLIP, if it is not where the scene file says."""
 
@@ -50,8 +55,18 @@ class View:
         server = PageServer(page, self.host, self.port)
         who = "anyone with this address" if server.access.needs_token else "this machine only"
         say(f"Open {server.access.address} ({who}). Ctrl-C ends it.")
+        if elsewhere := server.access.elsewhere:
+            say(f"From other machines: {elsewhere}")
+        if self.browser and _has_display():
+            webbrowser.open(server.access.address)
         with contextlib.suppress(KeyboardInterrupt), server:
             server.serve_forever()
+
+
+def _has_display() -> bool:
+    """Return whether somebody sits at this machine, in front of a desktop."""
+    desktop = sys.platform in ("darwin", "win32") or {"DISPLAY", "WAYLAND_DISPLAY"} & os.environ.keys()
+    return bool(desktop) and sys.stdout.isatty() and "SSH_CONNECTION" not in os.environ
 
 
 @dataclass(kw_only=True)

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from lang3dxl_ns.common.console import say
+from lang3dxl_ns.common.errors import UserError
 
 _INSTALL = "https://pytorch.org/get-started/locally"
 Moved = TypeVar("Moved", bound=Tensor)
@@ -30,6 +31,22 @@ def best_device() -> str:
         return "cuda"
     warn_of_unused_gpu()
     return "cpu"
+
+
+def known_device(device: torch.device | str | int | None = None) -> torch.device:
+    """Return the device to compute on, by default the best. Raises UserError for one that this machine does
+    not have, and for Apple's GPUs, which lack the 64-bit numbers that cameras and words need."""
+    try:
+        found = torch.device(best_device() if device is None else device)
+    except (RuntimeError, TypeError, ValueError) as error:
+        raise UserError(f"there is no device {device!r}: give cpu, cuda or cuda:NUMBER") from error
+    if found.type not in ("cpu", "cuda"):
+        raise UserError(f"{found} can't compute scenes: give cpu, cuda or cuda:NUMBER")
+    if found.type == "cuda" and not torch.cuda.is_available():
+        raise UserError(f"{unused_gpu() or 'torch finds no GPU here'}: give cpu")
+    if found.type == "cuda" and (found.index or 0) >= torch.cuda.device_count():
+        raise UserError(f"there is no {found}: this machine has {torch.cuda.device_count()} GPUs")
+    return found
 
 
 @functools.cache

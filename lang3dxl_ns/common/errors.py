@@ -8,11 +8,26 @@ import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+from lang3dxl_ns.common.memory import ran_out_of_memory
+
 DAMAGE = (
     *(OSError, EOFError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RuntimeError),
-    *(MemoryError, AssertionError, struct.error, zlib.error),
+    *(AssertionError, struct.error, zlib.error),
 )
-"""Exceptions raised when values are read that a damaged file does not have."""
+"""Exceptions raised when values are read that a damaged file does not have. A RuntimeError may also mean a
+full memory, which `not_of_memory` tells apart."""
+
+
+NO_NERFSTUDIO = (
+    "this needs nerfstudio, which is not installed: pip install -e '.[nerfstudio]' in the checkout, with "
+    "Python 3.10 to 3.12"
+)
+
+
+def misses_nerfstudio(error: BaseException) -> bool:
+    """Return whether an import failed because the extra `nerfstudio` is not installed."""
+    name = error.name if isinstance(error, ModuleNotFoundError) else None
+    return (name or "").partition(".")[0] in ("nerfstudio", "viser")
 
 
 class UserError(Exception):
@@ -32,7 +47,14 @@ def readable(
     except UserError:
         raise
     except errors as error:
+        not_of_memory(error)
         raise UserError(f"{problem} ({in_a_line(error, most)}): {remedy}") from error
+
+
+def not_of_memory(error: BaseException) -> None:
+    """Raise the error again if it means a full memory, so that no file is blamed for it."""
+    if ran_out_of_memory(error):
+        raise error
 
 
 def printable(text: str) -> str:

@@ -14,6 +14,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
 
+from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import UserError, readable
 
 _MOST_BYTES = 64 << 20
@@ -37,12 +38,14 @@ def check_regular(path: Path) -> None:
 
 
 def read_text(path: Path, most: int = _MOST_BYTES) -> str:
-    """Read UTF-8 text from a regular file. Raises OSError, or ValueError for more than `most` bytes."""
+    """Read UTF-8 text (or UTF-16 with a mark) from a regular file. Raises OSError, or ValueError for more
+    than `most` bytes."""
     with open_file(path) as file:
         content = file.read(most + 1)
     if len(content) > most:
         raise ValueError(f"it is larger than {most >> 20} MiB")
-    return content.decode("utf-8-sig")  # without the mark that Windows' editors put first
+    # Windows' editors put a mark first, and some of its programs write two bytes per character.
+    return content.decode("utf-16" if content[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig")
 
 
 def read_json(path: Path, most: int = _MOST_BYTES) -> Any:
@@ -73,18 +76,28 @@ def read_array(path: Path) -> Any:
 
 
 def write_atomically(path: Path, content: str | bytes) -> None:
-    """Write to a temporary file beside `path`, then rename it, so that readers never see a partial file. If
-    the process is killed, the old content remains, beside a leftover .tmp file. A link stays a link. A device
-    (/dev/stdout) or a pipe is written to, and never replaced by a file."""
+    """Write a file that a user named, as `replace_file` does, but through a link, which stays a link. A
+    device (/dev/stdout) or a pipe is written to, and never replaced by a file."""
+    make_folder(path.parent)
+    if path.exists() and not path.is_file():
+        path.write_bytes(content.encode() if isinstance(content, str) else content)
+        return
+    replace_file(path.resolve(), content)
+
+
+def replace_file(path: Path, content: str | bytes) -> None:
+    """Write a file under a name that we chose: to a temporary file beside it, which is then renamed, so that
+    readers never see a partial file. If the process is killed, the old content remains, beside a leftover
+    .tmp file. A link or pipe of this name, which someone else made, is replaced and never followed. A
+    replaced file keeps its mode."""
     make_folder(path.parent)
     content = content.encode() if isinstance(content, str) else content
-    if path.exists() and not path.is_file():
-        path.write_bytes(content)
-        return
-    path = path.resolve()
     temporary = path.with_name(f"{path.name}.{os.getpid()}-{secrets.token_hex(4)}.tmp")
     try:
         with temporary.open("xb") as file:
+            with contextlib.suppress(OSError):  # there is none yet, or the disk has no modes
+                if stat.S_ISREG((old := path.lstat()).st_mode):
+                    os.chmod(temporary, stat.S_IMODE(old.st_mode))
             file.write(content)
             file.flush()
             os.fsync(file.fileno())  # otherwise a crash may leave the new name without content
@@ -97,22 +110,41 @@ def write_atomically(path: Path, content: str | bytes) -> None:
         raise
 
 
+def set_aside(path: Path) -> Path:
+    """Rename a file that is not ours to overwrite to NAME.old, or NAME.old2 …, and return the new name."""
+    path = path.resolve()
+    forms = (path.with_name(f"{path.name}.old{number or ''}") for number in (0, *range(2, 10_000)))
+    kept = next(form for form in forms if not os.path.lexists(form))
+    path.rename(kept)
+    return kept
+
+
 @contextlib.contextmanager
 def locked(folder: Path, busy: str | None = None) -> Iterator[None]:
     """Hold the lock of a folder itself: unlike a lock file, it leaves nothing beside a user's files, and a
-    killed process gives it up too. If another process holds it, wait, or raise UserError with the message
-    `busy`. Where the system has no such locks, nothing is held."""
+    killed process gives it up too. If another process holds it, say so and wait, or raise UserError with the
+    message `busy`. Where the system has no such locks, nothing is held."""
     make_folder(folder)
     with contextlib.ExitStack() as held:
-        try:
-            import fcntl  # absent on Windows
+        with contextlib.suppress(ImportError, OSError):  # Windows; network disks
+            import fcntl
 
             held.callback(os.close, descriptor := os.open(folder, os.O_RDONLY))
-            fcntl.flock(descriptor, fcntl.LOCK_EX | (fcntl.LOCK_NB if busy else 0))
-        except BlockingIOError as error:
-            raise UserError(busy) from error
-        except (ImportError, OSError):  # network disks
-            pass
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError as error:
+                if busy:
+                    raise UserError(busy) from error
+                say(f"Waiting for another command that writes in {folder} …")
+                fcntl.flock(descriptor, fcntl.LOCK_EX)
+        yield
+
+
+@contextlib.contextmanager
+def file_locked(path: Path) -> Iterator[None]:
+    """Hold the lock under which a file is changed: that of the folder that the file itself is in, whichever
+    link names it. Wait for it like `locked`."""
+    with locked(path.resolve().parent):
         yield
 
 

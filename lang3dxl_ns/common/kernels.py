@@ -13,6 +13,8 @@ from lang3dxl_ns.common.errors import UserError, in_a_line
 
 VARIABLE = "LANG3DXL_CPU_KERNELS"
 """Environment variable that disables the compiled kernels if it is "torch", as in the tests."""
+MOST_SUMS = 512 * 2**20
+"""Most bytes of the sums that threads keep apart in a backward pass; large scenes use fewer threads."""
 
 
 def takes_kernels(tensor: Tensor, wanted: str | None = None) -> bool:

@@ -15,7 +15,7 @@ from jaxtyping import Shaped, UInt8
 from numpy import ndarray as Array
 from PIL import ExifTags, Image
 
-from lang3dxl_ns.common.errors import DAMAGE
+from lang3dxl_ns.common.errors import DAMAGE, not_of_memory
 from lang3dxl_ns.common.files import open_file
 
 FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP", "GIF", "AVIF", "HEIF")
@@ -62,6 +62,7 @@ def open_picture(path: Path) -> Iterator[Image.Image]:
     except (*DAMAGE, SyntaxError, Image.DecompressionBombError) as error:
         if isinstance(error, OSError) and error.errno is not None:  # an error of the disk, not of the decoder
             raise
+        not_of_memory(error)
         raise NoPictureError(str(error) or type(error).__name__) from error
 
 

@@ -27,7 +27,7 @@ class Stages:
         self._current: str | None = None
         self._start, self._tenths = 0.0, -1
         self._recent: deque[tuple[float, float]] = deque()
-        """Moments of the last seconds, each with the fraction that was done; the stage's start is the first."""
+        """Recent moments, each with the fraction that was done; the stage's start is the first."""
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
@@ -54,8 +54,8 @@ class Stages:
         self._current = None
 
     def progress(self, done: float) -> None:
-        """Say about how long everything that is left takes at the pace of the last minute, once that is known
-        and at every tenth of the stage. `done` is the fraction of the stage, as far as this command does it."""
+        """Say about how long everything that is left takes at the pace of the last minute, once that is
+        known, and at every tenth of the stage. `done` is the fraction of the stage in this command."""
         now = time.perf_counter()
         self._recent.append((now, done))
         while len(self._recent) > 2 and now - self._recent[1][0] > _WINDOW_S:

@@ -71,7 +71,7 @@ class Decoder(nn.Module, ABC):
         """Return initial codes, one per Gaussian; None if Gaussians learn none."""
         return None
 
-    def carried(self, gaussians: Mapping[str, Tensor]) -> Float[Tensor, "n d"] | None:
+    def carried(self, gaussians: Mapping[str, Tensor] | nn.ParameterDict) -> Float[Tensor, "n d"] | None:
         """Return the values to render, from the Gaussians' raw parameters; None if there are none (yet)."""
         return gaussians.get("codes")
 

@@ -18,7 +18,7 @@ from numpy import ndarray as Array
 
 from lang3dxl_ns.common.checks import expect
 from lang3dxl_ns.common.console import say
-from lang3dxl_ns.common.errors import DAMAGE, UserError, in_a_line
+from lang3dxl_ns.common.errors import DAMAGE, UserError, in_a_line, not_of_memory
 from lang3dxl_ns.common.files import expanded
 from lang3dxl_ns.files.activations import check_memory, tensor_of
 from lang3dxl_ns.files.checkpoints import read_checkpoint
@@ -74,6 +74,7 @@ def read_splats(path: str | Path) -> Splats:
     except UserError as error:
         raise UserError(f"{path}: {error}") from error
     except DAMAGE as error:
+        not_of_memory(error)
         reason = in_a_line(error)
         raise UserError(f"{path} is damaged or incomplete ({reason}): copy or export it again") from error
     return _finite(splats, path)

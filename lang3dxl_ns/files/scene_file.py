@@ -10,7 +10,7 @@ from __future__ import annotations
 import io
 import json
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from math import prod
 from pathlib import Path
@@ -27,9 +27,9 @@ from torch import Tensor
 from lang3dxl_ns import __version__
 from lang3dxl_ns.common.checks import expect
 from lang3dxl_ns.common.console import say
-from lang3dxl_ns.common.device import best_device
-from lang3dxl_ns.common.errors import DAMAGE, UserError, in_a_line
-from lang3dxl_ns.common.files import expanded, locked, slugs, write_atomically
+from lang3dxl_ns.common.device import known_device
+from lang3dxl_ns.common.errors import DAMAGE, UserError, in_a_line, not_of_memory
+from lang3dxl_ns.common.files import expanded, file_locked, set_aside, slugs, write_atomically
 from lang3dxl_ns.components.appearance import AppearanceConfig, AppearanceField
 from lang3dxl_ns.components.decoders import DecoderConfig, make_decoder
 from lang3dxl_ns.components.feature_decoder import Decoder
@@ -41,8 +41,8 @@ from lang3dxl_ns.query.text import EncodeTexts
 from lang3dxl_ns.query.vocabulary import common_words
 from lang3dxl_ns.rendering import Splats
 from lang3dxl_ns.scene.camera import MOST_PIXELS, resized
-from lang3dxl_ns.scene.record import SceneRecord, scene_from_json
-from lang3dxl_ns.words.taught_words import TaughtWord, known_word, save_words
+from lang3dxl_ns.scene.record import SceneRecord, same_clip, scene_from_json
+from lang3dxl_ns.words.taught_words import TaughtWord, known_word, save_words, words_from_json
 
 Module = TypeVar("Module", bound=torch.nn.Module)
 SUFFIX = ".scene"
@@ -151,12 +151,15 @@ def replace_scene(path: Path, scene: Scene, told: Provenance, *earlier: Path) ->
     """Write a scene over the file that it replaces, as `write_scene`, with the words taught there and in
     `earlier` files, and with its credit and license unless others are told. Return the written
     scene and the number of bytes. A command that teaches there at this moment comes first, or waits."""
-    with locked(path.parent):
+    with file_locked(path):
+        if path.is_file():
+            try:
+                old = describe_scene_file(path)["provenance"]
+                told = replace(told, credit=told.credit or old.credit, license=told.license or old.license)
+            except UserError as error:  # a newer format, a cut copy, or no scene at all
+                say(f"{error}. The file is kept as {set_aside(path)}")
         for file in (path, *earlier):
             scene = _with_words_of(scene, file, path)
-        with suppress(UserError):  # no such file, or a damaged one
-            old = describe_scene_file(path)["provenance"]
-            told = replace(told, credit=told.credit or old.credit, license=told.license or old.license)
         return scene, write_scene(path, scene, told)
 
 
@@ -169,7 +172,7 @@ def _with_words_of(scene: Scene, earlier: Path, replaced: Path) -> Scene:
     try:
         words = describe_scene_file(earlier)["taught"]
     except UserError as error:
-        say(f"Words taught in {earlier.name} are lost: {error}")
+        say(f"Words taught in {earlier.name} are not taken over: {error}")
         return scene
     for word in words:
         name, new = known_word(word.name), scene.words.get(known_word(word.name))
@@ -222,12 +225,14 @@ def read_scene(
     """Read a scene file. Nothing in it is executed, and no memory is allocated beyond what it holds. device:
     by default a GPU if there is one. encode_texts: the scene's CLIP, if it is already loaded, or is not where
     the file says. Raises UserError if the file is missing, damaged, cut short, or of a newer version."""
-    path, device = expanded(path), torch.device(device or best_device())
+    path, device = expanded(path), known_device(device)
     with _opened(path) as file:
         splats, decoder, codes, looks, vectors = _splats(file), None, None, None, None
         if (settings := file.about.get("decoder")) is not None:
             decoder = _decoder(file, settings)
             expect({len(w.vector) for w in file.taught} <= {decoder.clip_dim}, "a word is of another CLIP")
+            fit = all(same_clip(word.clip, file.scene.clip_identity) for word in file.taught)
+            expect(fit, "a word was learned with another CLIP")
             codes = _codes(file, decoder, len(splats))
         if (described := file.about.get("looks")) is not None:
             looks = _looks(file, described)
@@ -283,7 +288,7 @@ class _File:
         if self.background is not None:
             channels = [isinstance(x, int | float) and 0 <= x <= 1 for x in self.background]
             expect(channels == [True] * 3, "its background is no color")
-        self.taught = [TaughtWord.from_json(word) for word in self.about.get("taught", [])]
+        self.taught = words_from_json(self.about.get("taught", []))
 
     def tensor(self, name: str, *shape: int) -> Tensor:
         """Read a tensor of any type with this shape. Raises ValueError for another shape."""
@@ -332,6 +337,7 @@ def _opened(path: Path) -> Iterator[_File]:
     except _NewerError as error:
         raise UserError(f"{path} has format {error}: a newer lang3dxl-ns wrote it; update yours") from error
     except (UserError, SafetensorError, SyntaxError, Image.DecompressionBombError, *DAMAGE) as error:
+        not_of_memory(error)
         remedy = "copy it again" if path.suffix == SUFFIX else "a splat becomes one with lang3dxl attach"
         raise UserError(f"{path} is not a readable scene ({in_a_line(error)}): {remedy}") from error
 
@@ -342,7 +348,7 @@ def _splats(file: _File) -> Splats:
     expect(bands in (1, 4, 9, 16), f"{bands} harmonics")
     antialiased = file.about["antialiased"]
     expect(isinstance(antialiased, bool), "antialiased")
-    return Splats(
+    splats = Splats(
         file.tensor("means", count, 3).float(),
         file.tensor("quats", count, 4).float(),
         file.tensor("log_scales", count, 3).float().exp(),
@@ -350,6 +356,8 @@ def _splats(file: _File) -> Splats:
         file.tensor("harmonics", count, bands, 3).float(),
         antialiased,
     )
+    expect(bool(splats.sound().any()), "it holds no Gaussian whose values are all numbers")
+    return splats
 
 
 def _codes(file: _File, decoder: Decoder, count: int) -> Float[Tensor, "n d"]:

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.scene.camera import Camera, Lens, view_matrix
+from lang3dxl_ns.training.state import PhotoCamera
 
 
 def to_nerfstudio(lenses: Sequence[Lens], camera_to_worlds: Float[Tensor, "n 3 4"]) -> Cameras:
@@ -44,4 +45,15 @@ def to_rasterizer(camera: Cameras, pose: Float[Tensor, "3 4"] | None = None) -> 
         intrinsics=camera.get_intrinsics_matrices()[0],
         width=int(camera.width.item()),
         height=int(camera.height.item()),
+    )
+
+
+def photo_camera(camera: Cameras) -> PhotoCamera:
+    """Convert a nerfstudio camera for a training step."""
+    return PhotoCamera(
+        camera.camera_to_worlds[0],
+        camera.get_intrinsics_matrices()[0],
+        int(camera.width.item()),
+        int(camera.height.item()),
+        (camera.metadata or {}).get("cam_idx"),
     )

@@ -14,13 +14,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lang3dxl_ns.query.doubt import doubtful
 from lang3dxl_ns.query.match import Found
 from lang3dxl_ns.query.question import QueryConfig, Question, pictures
 from lang3dxl_ns.query.scene import Scene, text_encoder
 from lang3dxl_ns.query.text import EncodeTexts, caution
 from lang3dxl_ns.rendering import Rendering
 from lang3dxl_ns.scene.record import SceneRecord
+from lang3dxl_ns.training.learn_codes import forget_words
 
 _LONGEST = 40
 """Most characters of a prompt in the summary."""
@@ -95,33 +95,34 @@ class Conversation:
         """Return a snapshot of the present model. After training there is one final snapshot; during training
         a snapshot is reused for at most a tenth of the run."""
         with self._making:
-            learning, step = self.learning(), self.model.step
             behind, taken = self.model.config.total_steps / 10, self._scene_step
-            recent = taken is None or (learning and step - taken <= behind)
+            recent = taken is None or (self.learning() and self.model.step - taken <= behind)
             if self._scene is None or not recent:
                 self._encode_texts = self._encode_texts or text_encoder(self.file, self.model.device)
-                self._scene = self._snapshot(learning)
-                self._scene_step = step if learning else None
+                self._scene, self._scene_step = self._snapshot()
             return self._scene
 
-    def _snapshot(self, learning: bool) -> Scene:
-        # In training every snapshot is examined anew, so keep that brief.
-        config = QueryConfig(views=24, view_side=160) if learning else QueryConfig()
-        cache = None if learning else self.run / "lang3dxl_visible.safetensors"
+    def _snapshot(self) -> tuple[Scene, int | None]:
+        """Take a snapshot; return it with the iteration that it was taken at (None: training was over)."""
         field = self.model.semantic_field
         with self.lock, torch.no_grad():
-            training = self.model.training
+            # Asked inside the lock, since training may end, and learn its words, while it is waited for.
+            learning, step, training = self.learning(), self.model.step, self.model.training
+            # In training every snapshot is examined anew, so keep that brief.
+            config = QueryConfig(views=24, view_side=160) if learning else QueryConfig()
+            cache = None if learning else self.run / "lang3dxl_visible.safetensors"
             self.model.train(False)
             try:
                 if learning and field is not None and field.needs_lifting:
                     self.watch("gathering the photos' features onto the present scene…")
                     self.learn()
-                return self.model.scene(
+                scene = self.model.scene(
                     self.file, config=config, encode_texts=self._encode_texts, cache=cache, watch=self.watch
                 )
+                return scene, step if learning else None
             finally:
                 if learning:
-                    self.model.forget_gathered_codes()
+                    forget_words(self.model.run)
                 self.model.train(training)
 
     # ── answering: called by the render thread, which holds the lock ────────────────────────────────
@@ -163,7 +164,7 @@ class Conversation:
             where = f"{count} good views, best {best:.2f}" if count else "nothing in the scene looks like it"
             lines.append(f"**{plain(text)}**: {where}")
             taught = found.prompt.taught is not None
-            warnings = (None if taught else caution(text), doubtful(text, found.doubt, taught))
+            warnings = (None if taught else caution(text), str(found.trust))
             lines += [plain(line) for line in warnings if line]
         return "  \n".join(lines)
 

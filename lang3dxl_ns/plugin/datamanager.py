@@ -7,9 +7,8 @@ from dataclasses import dataclass, field
 from functools import cached_property, partial
 from itertools import chain, repeat
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Any, Literal
 
-import torch
 import tyro
 from jaxtyping import Float
 from nerfstudio.cameras.cameras import Cameras
@@ -25,7 +24,6 @@ from rich.markup import escape
 from torch import Tensor
 
 from lang3dxl_ns.common.checks import check_numbers
-from lang3dxl_ns.common.device import to_device
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import expanded
 from lang3dxl_ns.common.memory import machine_memory
@@ -40,9 +38,8 @@ from lang3dxl_ns.plugin.dataparser import (
 from lang3dxl_ns.plugin.inert_settings import OF_IMAGE_CACHES
 from lang3dxl_ns.plugin.nerfstudio_scenes import photos_of, reconstruction_of
 from lang3dxl_ns.plugin.photo_dataset import EvalPhotos, PhotoDataset
-from lang3dxl_ns.preparation.encoders import usual_dense
 from lang3dxl_ns.preparation.foreground import foreground_kind, with_foreground
-from lang3dxl_ns.preparation.model_files import CLIP_OPTION, find_model, usual_clip
+from lang3dxl_ns.preparation.model_files import CLIP_OPTION, find_model
 from lang3dxl_ns.preparation.needs import Need, needs_table, scene_needs
 from lang3dxl_ns.preparation.photo_cache import PhotoCache, has_vanished
 from lang3dxl_ns.preparation.physical_scale import CropPlan, plan_crops
@@ -57,6 +54,7 @@ from lang3dxl_ns.scene.colmap import Reconstruction
 from lang3dxl_ns.scene.frame import Frame
 from lang3dxl_ns.scene.photo import Photo
 from lang3dxl_ns.scene.record import SCENE_FILE, ScenePhoto, SceneRecord
+from lang3dxl_ns.training.batches import MOST_GONE, read_targets, to_batch
 
 
 @without(*OF_IMAGE_CACHES)
@@ -92,25 +90,13 @@ class Lang3DXLDataManagerConfig(PreparationConfig, FullImageDatamanagerConfig):
         check_numbers(self.dataparser, {n: b for n, b in _OF_PARSER.items() if hasattr(self.dataparser, n)})
 
     def settle_targets(self, learned: bool, gathered: bool) -> None:
-        """Resolve what is prepared: semantics `learned` with the scene use regions and targets in every step;
-        features `gathered` onto Gaussians, also those that codes start from, need fine crops."""
-        self.clip = usual_clip(self.clip)
+        """Resolve what is prepared as `settle`, and whether steps read targets."""
         self.targets_in_steps = learned
-        if self.crops == "auto":
-            self.crops = "fine" if gathered else "pyramid"
-        if not learned or self.clip == "none":
-            self.regions = "none"
-        self.dense = "none" if self.clip == "none" else usual_dense(self, learned)
+        self.settle(learned, gathered)
 
 
-_IN_A_STEP = {"clip_target": torch.float32, "dense_target": torch.float32, "regions": torch.int64}
-"""Number types of targets in a step; in memory they are kept half as wide."""
 _BOUNDS = {"camera_res_scale_factor": (0.001, 8), "cache_gb": (0, 1e6), "read_ahead": (0, 1000)}
 _OF_PARSER = {"scale_factor": (1e-9, 1e9), "scene_scale": (1e-9, 1e9), "train_split_fraction": (0, 1)}
-
-
-MOST_GONE = 0.1
-"""Share of the training photos that may vanish before training ends."""
 
 
 class Lang3DXLDataManager(FullImageDatamanager):
@@ -128,15 +114,15 @@ class Lang3DXLDataManager(FullImageDatamanager):
         self._gone = 0
         if config.data is not None:
             config.dataparser.data = Path(config.data)
-        # never find a run's own cameras anew: its Gaussians would not match them
-        config.dataparser = parser_for(config.dataparser, config.cache_dir, config.run is None)
-        if isinstance(config.dataparser, PhotoCollectionDataParserConfig):
-            config.data = config.dataparser.data
-        if hasattr(config.dataparser, "load_3D_points"):
-            config.dataparser.load_3D_points = True  # off by default in some of nerfstudio's
         opens = kwargs.get("test_mode", "val") != "val"
         recorded = recorded_scene(config.run) if opens else None
         try:
+            # never find a run's own cameras anew: its Gaussians would not match them
+            config.dataparser = parser_for(config.dataparser, config.cache_dir, config.run is None)
+            if isinstance(config.dataparser, PhotoCollectionDataParserConfig):
+                config.data = config.dataparser.data
+            elif hasattr(config.dataparser, "load_3D_points"):
+                config.dataparser.load_3D_points = True  # off by default in some of nerfstudio's
             super().__init__(config, *args, **kwargs)
             if recorded is not None:
                 self._check_recorded(SceneRecord.read(recorded.run / SCENE_FILE))
@@ -229,7 +215,8 @@ class Lang3DXLDataManager(FullImageDatamanager):
         used += [foreground_kind(c)] if c.foreground == "text" else []
         used += [REGIONS] if self._region_source is not None else []
         names = [photo.name for d in (self.train_dataset, self.eval_dataset) for photo in d.photos]
-        return FeatureStore(self.cache_dir).clean(used, names)
+        shared = self.config.cache_dir is not None
+        return FeatureStore(self.cache_dir).clean(used, names, shared)
 
     @cached_property
     def crop_plan(self) -> CropPlan:
@@ -272,7 +259,7 @@ class Lang3DXLDataManager(FullImageDatamanager):
         return SceneRecord(
             photos=[*trained, *(photo for photo in held_out if photo.name not in names)],
             clip=None if known is None else known.address,
-            clip_identity=None if known is None else known.identity,
+            clip_identity=None if known is None else known.clip_identity,
             scale=frame.scale,
             transform=frame.transform.tolist(),
             data=str(expanded(self.data_folder).absolute()),
@@ -417,33 +404,20 @@ class Lang3DXLDataManager(FullImageDatamanager):
         return int((self.train_dataset.cameras.width * self.train_dataset.cameras.height).float().mean())
 
     def _read(self, dataset: PhotoDataset, index: int, with_targets: bool = True) -> dict[str, Any]:
-        """Read a photo's data for a step as they are kept in memory: bytes and half precision. The data are
-        `image` [h, w, 3] uint8, `mask` [h, w, 1] bool if any, and with targets `clip_target` [Hd, Wd, C],
-        `crop_sides` (fractions of the width) and, if any, `dense_target` [t, t, D] and `regions` [h, w]
-        (labels, −1 for none)."""
+        """Read a photo's data for a step; see `batches.read_data`."""
         data: dict[str, Any] = dict(dataset.read(index))
         if self.targets is not None and with_targets:
-            name = dataset.photos[index].name
-            clip = self.targets.clip(name)
-            found = {"clip_target": clip.features, "dense_target": self.targets.dense(name)}
-            found["regions"] = self.targets.regions(name)
-            # Clone the values, so that they are read from disk now and not during the step.
-            data |= {key: value.clone() for key, value in found.items() if value is not None}
-            data["crop_sides"] = clip.crop_fractions
+            data |= read_targets(dataset.photos[index].name, self.targets)
         return data
 
     def _batch(self, dataset: PhotoDataset, index: int, data: dict[str, Any]) -> tuple[Cameras, Batch]:
         """Put a photo's data for a step on the device, with `name` and `image_idx`. The camera stays on the
         CPU, since the host reads its size and would wait for a GPU."""
-        batch: dict[str, Any] = {"image_idx": index, "name": dataset.photos[index].name}
-        for key, value in data.items():
-            if isinstance(value, Tensor):
-                value = to_device(value, self.device).to(_IN_A_STEP.get(key, value.dtype))
-            batch[key] = value
+        batch = to_batch(data, dataset.photos[index].name, index, self.device)
         camera = dataset.cameras[index : index + 1]
         if dataset is self.train_dataset:  # whose cameras may be refined
             camera.metadata = {"cam_idx": index}
-        return camera, cast(Batch, batch)
+        return camera, batch
 
 
 def _log(message: str) -> None:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
 
+import numpy as np
 import torch
 from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataParserConfig, DataparserOutputs
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
@@ -141,7 +142,7 @@ class RecordedSceneDataParser(DataParser):
         photos = [photo.photo(Path(scene.data)) for photo in chosen]
         poses = torch.tensor([photo.camera_to_world for photo in chosen], dtype=torch.float32)
         cameras = to_nerfstudio([photo.lens for photo in photos], poses)
-        return DataparserOutputs(
+        return CaptureOutputs(
             image_filenames=[photo.path for photo in photos],
             cameras=cameras,
             scene_box=SceneBox(torch.tensor([[-1.0] * 3, [1.0] * 3])),
@@ -153,6 +154,7 @@ class RecordedSceneDataParser(DataParser):
             },
             dataparser_transform=torch.tensor(scene.transform, dtype=torch.float32),
             dataparser_scale=scene.scale,
+            frame=Frame(np.array(scene.transform, np.float64), scene.scale),
         )
 
 

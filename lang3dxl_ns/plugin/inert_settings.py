@@ -7,6 +7,7 @@ from typing import Any
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.plugin.optimizers import parameter_groups
+from lang3dxl_ns.training.learning_rates import learning_rates
 
 OF_SPLATFACTO = (
     *("enable_collider", "collider_params", "loss_coefficients", "eval_num_rays_per_chunk", "prompt"),
@@ -49,7 +50,7 @@ def check_inert(model: Any, data: Any, optimizers: Mapping[str, Any] | None = No
         return
     changed = _changed(model, _OF_RENDERINGS, "--pipeline.model.")
     changed += _changed(model.semantic_field, ("code_std",), "--pipeline.model.semantic-field.")
-    default = parameter_groups()
+    default = parameter_groups(learning_rates())
     changed += [
         f"--optimizers.{name.replace('_', '-')}"
         for name in _GROUPS_OF_RENDERINGS

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from nerfstudio.data.scene_box import SceneBox
 
-from lang3dxl_ns.common.device import best_device
+from lang3dxl_ns.common.device import known_device
 from lang3dxl_ns.common.errors import UserError, readable
 from lang3dxl_ns.files.runs import find_config
 from lang3dxl_ns.plugin.model import Lang3DXLModel, Lang3DXLModelConfig
@@ -43,7 +43,7 @@ def load_run(
     Raises:
         UserError: the folder has no checkpoint, or the run is damaged or of another method.
     """
-    place, worker = find_config(run), torch.device(device or best_device())
+    place, worker = find_config(run), known_device(device)
     settings, checkpoints = read_model_config(place)
     folder, file = place.parent, SceneRecord.read(place.parent / SCENE_FILE)
     path, checkpoint = latest_checkpoint(folder / checkpoints)

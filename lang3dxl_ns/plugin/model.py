@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from copy import deepcopy
 from dataclasses import dataclass, field
-from functools import partial
-from math import isqrt
 from typing import Any
 
 import torch
@@ -15,36 +12,21 @@ from jaxtyping import Bool, Float
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.model_components.lib_bilagrid import color_correct
 from nerfstudio.utils.colors import get_color
-from nerfstudio.utils.rich_utils import CONSOLE
 from pytorch_msssim import SSIM
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn import Parameter
 
-from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.image import fitted_size, resize_nearest
-from lang3dxl_ns.common.reports import part
-from lang3dxl_ns.components import losses
+from lang3dxl_ns.components.losses import resize
 from lang3dxl_ns.evaluation.photo_metrics import Lpips, feature_metrics, match, psnr, reached
-from lang3dxl_ns.plugin.model_config import ModelSettings, make_strategy
-from lang3dxl_ns.plugin.optimizers import semantic_ramp
-from lang3dxl_ns.plugin.optional_components import build_components, component_parameters, match_components
+from lang3dxl_ns.plugin.cameras import photo_camera
+from lang3dxl_ns.plugin.model_config import ModelSettings
 from lang3dxl_ns.plugin.rendering_model import RenderingModel
 from lang3dxl_ns.plugin.splatfacto import SplatfactoModel
 from lang3dxl_ns.preparation.targets import Batch, foreground
-from lang3dxl_ns.training.initialization import (
-    EVERY,
-    FREE,
-    center_and_radius,
-    color_parameters,
-    initial_gaussians,
-    keep_in_bounds,
-    seed_positions,
-)
-from lang3dxl_ns.training.learn_codes import TargetView, learn_codes
-
-LONGER_SIDE = 1_600
-"""Longer side in pixels to which larger photos are reduced for gathering: a CLIP crop covers hundreds of
-pixels, and time and memory grow with their number."""
+from lang3dxl_ns.training.learn_codes import learn_words
+from lang3dxl_ns.training.state import Training
+from lang3dxl_ns.training.step import finish, losses
 
 
 @dataclass
@@ -59,21 +41,10 @@ class Lang3DXLModel(RenderingModel):
 
     def populate_modules(self) -> None:
         """Build Gaussians, strategy, components and metrics (on the CPU; the pipeline moves them)."""
-        c = self.config
-        c.fit_to_run(c.total_steps)
-        if not self.facts.wants("view dependence", c.view_dependence):
-            c.sh_degree = 0
-        points = None if c.random_init else self.seed_points
-        means, colors = seed_positions(points, c.num_random, c.random_scale)
-        self.extent = center_and_radius(means)
-        first = initial_gaussians(means, colors, c.sky_gaussians, c.sh_degree)
-        self.gauss_params = nn.ParameterDict(first)
-        self.strategy = make_strategy(self.config)
-        self.strategy.cameras, self.strategy.free = self.facts.positions, FREE * self.extent[1]
-        self.strategy_state = self.strategy.initialize_state(scene_scale=1.0)
-        build_components(self)
-        self.step = 0
-        self.step_is_sound = True
+        self.config.fit_to_run(self.config.total_steps)
+        self.run = Training.begin(self.config, self.facts, self.seed_points)
+        self.gauss_params = self.run.gaussians
+        self.adopt_parts()
         self.ssim = SSIM(data_range=1.0, size_average=True, channel=3)
         self.lpips = Lpips()
         self.crop_box = None
@@ -84,59 +55,17 @@ class Lang3DXLModel(RenderingModel):
     # ── training ────────────────────────────────────────────────────────────────────────────────────
 
     def step_post_backward(self, step: int) -> None:
-        """Finish an iteration: densify and prune (except at step 0, where the strategy would reset opacities,
-        and after a skipped step), keep Gaussians in bounds, and write the sky's colors."""
-        if step > 0 and self.step_is_sound:
-            before = self.num_points
-            self.strategy.step_post_backward(
-                self.gauss_params, self.optimizers, self.strategy_state, self.step
-            )
-            if self.num_points != before:
-                CONSOLE.log(f"Step {step}: {before} → {self.num_points} Gaussians")
-        if step % EVERY == 0 or step + 1 == self.config.total_steps:
-            keep_in_bounds(self.gauss_params, *self.extent, self.strategy.still, self.config.sh_degree)
-        if self.sky is not None:
-            with torch.no_grad():
-                colors = color_parameters(self.sky.colors, self.config.sh_degree)
-                self.gauss_params["features_dc"][: len(self.sky)] = colors
+        """Finish an iteration."""
+        finish(self.run)
 
     def learn_from_photos(self, photos: Iterable[tuple[Cameras, Batch]], count: int) -> None:
         """Give the Gaussians codes that represent the targets of this number of photos (cameras and batches);
         see `learn_codes`."""
-        decoder, facts = self.semantic_field, self.facts
-        assert decoder is not None and facts.clip_targets is not None
-        views, means = (self._target_view(*photo) for photo in photos), self.means.detach()
-        # Codes that training goes on from start at what it compares with, which is not sharpened.
-        dense = None if self.learns_from_renderings else facts.dense_targets
-        codes = learn_codes(decoder, views, count, means, facts.clip_targets, dense)
-        if self.learns_from_renderings:
-            self.gauss_params["codes"].data.copy_(codes.nan_to_num(0.0))
-        else:
-            self.gauss_params["codes"] = Parameter(codes.to(self.device), requires_grad=False)
-
-    def _target_view(self, camera: Cameras, batch: Batch) -> TargetView:
-        longer = int(torch.maximum(camera.width, camera.height).max())
-        if longer > LONGER_SIDE:
-            camera = deepcopy(camera)
-            camera.rescale_output_resolution(LONGER_SIDE / longer)
-        return TargetView(
-            partial(self.composite, camera),
-            (int(camera.height.item()), int(camera.width.item())),
-            batch["clip_target"],
-            batch.get("dense_target"),
-            foreground(batch),
-        )
-
-    def forget_gathered_codes(self) -> None:
-        """Remove codes that were gathered for a question in training, since the Gaussians still change."""
-        if not self.learns_from_renderings and "codes" in self.gauss_params:
-            del self.gauss_params["codes"]
+        learn_words(self.run, ((photo_camera(camera), batch) for camera, batch in photos), count)
 
     def get_param_groups(self) -> dict[str, list[Parameter]]:
-        """Return the optimizer groups: one per Gaussian property, and those of the components present."""
-        names = [n for n in self.gauss_params if n != "codes" or self.learns_from_renderings]
-        groups = {name: [self.gauss_params[name]] for name in names} | component_parameters(self)
-        return {name: parameters for name, parameters in groups.items() if parameters}
+        """Return the optimizer groups: one per Gaussian property, and those of the parts."""
+        return self.run.groups()
 
     # ── losses and metrics ──────────────────────────────────────────────────────────────────────────
 
@@ -144,61 +73,14 @@ class Lang3DXLModel(RenderingModel):
         self, outputs: dict, batch: Batch, metrics_dict: dict | None = None
     ) -> dict[str, Tensor]:
         """Compute the color loss and, if there are semantics, the semantic losses, all already weighted."""
-        mask = foreground(batch)
-        with part("losses"):
-            target = self.composite_with_background(self.get_gt_img(batch["image"]), outputs["background"])
-            loss = {"rgb": losses.rgb_loss(outputs["rgb"], target, mask, self.config.ssim_lambda)}
-        if self.training:
-            self.camera_optimizer.get_loss_dict(loss)
-        if "codes" in outputs and "clip_target" in batch:
-            loss |= self._semantic_losses(outputs["codes"], batch, mask)
-        return loss
-
-    def _semantic_losses(
-        self, codes: Float[Tensor, "h w 3"], batch: Batch, mask: Tensor | None
-    ) -> dict[str, Tensor]:
-        c = self.config
-        assert c.dense_weight is not None
-        ramp = semantic_ramp(self.step / c.total_steps, c.semantic_ramp)
-        clip, dense, small_mask = self._decode(codes, mask)
-        assert self.semantic_field is not None and self.downsampler is not None
-        with part("downsample"):
-            predicted, target, weight = self.downsampler.match(
-                clip, batch["clip_target"], batch["crop_sides"], small_mask
-            )
-        with part("losses"):
-            # Cells with little foreground have a low weight.
-            difference = losses.clip_loss(predicted, target, None if small_mask is None else weight)
-            loss = {"clip": ramp * c.clip_weight * difference}
-            if dense is not None and "dense_target" in batch:
-                difference = losses.dense_loss(dense, batch["dense_target"])
-                loss["dense"] = ramp * c.dense_weight * difference
-            if "regions" in batch:
-                labels = resize_nearest(batch["regions"], (clip.shape[0], clip.shape[1]))
-                loss["regions"] = c.region_weight * losses.region_variance_loss(clip, labels, small_mask)
-            own = self.semantic_field.own_losses(clip, dense)
-        return loss | {name: ramp * value for name, value in own.items()}
-
-    def _decode(self, codes: Float[Tensor, "h w 3"], mask: Tensor | None):
-        """Decode a code map → clip [h, w, C], dense [h, w, D] or None, and the mask resized to [h, w]."""
-        assert self.semantic_field is not None
-        with part("decode"):
-            clip, dense = self.semantic_field(codes)
-        return clip, dense, None if mask is None else resize_nearest(mask, (codes.shape[0], codes.shape[1]))
+        return losses(self.run, outputs["rgb"], outputs.get("codes"), batch)
 
     def get_metrics_dict(self, outputs: dict, batch: Batch) -> dict[str, Tensor]:
         """Compute numbers for the log: PSNR of the step's photo, and the number of Gaussians."""
-        target = self.composite_with_background(self.get_gt_img(batch["image"]), outputs["background"])
-        metrics = {
-            "psnr": psnr(outputs["rgb"].detach(), target),
-            "gaussian_count": torch.tensor(self.num_points),
-        }
-        if self.camera_optimizer.config.mode != "off":
-            change = self.camera_optimizer.pose_adjustment.detach()
-            for name, sizes in {"translation": change[:, :3], "rotation": change[:, 3:].rad2deg()}.items():
-                metrics[f"camera_opt_{name}_mean"] = sizes.norm(dim=1).mean()
-                metrics[f"camera_opt_{name}_max"] = sizes.norm(dim=1).max()
-        return metrics
+        found = psnr(outputs["rgb"].detach(), self.get_gt_img(batch["image"]))
+        metrics = {"psnr": found, "gaussian_count": torch.tensor(self.num_points)}
+        cameras = self.run.parts.cameras
+        return metrics if cameras is None else metrics | cameras.figures()
 
     @torch.no_grad()
     def get_image_metrics_and_images(  # type: ignore[override]
@@ -249,7 +131,7 @@ class Lang3DXLModel(RenderingModel):
         predicted, weight = match(clip, target, batch["crop_sides"], small_mask)
         metrics = feature_metrics("clip", predicted, target, self.clip_mean, weight)
         if dense is not None and "dense_target" in batch:
-            target = losses.resize(batch["dense_target"], dense.shape[:2])
+            target = resize(batch["dense_target"], dense.shape[:2])
             metrics |= feature_metrics("dense", dense, target, self.dense_mean, small_mask)
         return metrics
 
@@ -260,7 +142,10 @@ class Lang3DXLModel(RenderingModel):
         assert decoder is not None and carried is not None
         if not decoder.per_gaussian:
             codes = self.composite(camera, carried)
-            return self._decode(resize_nearest(codes, fitted_size(codes.shape, longer_side)), mask)
+            codes = resize_nearest(codes, fitted_size(codes.shape, longer_side))
+            clip, dense = decoder(codes)
+            size = (codes.shape[0], codes.shape[1])
+            return clip, dense, None if mask is None else resize_nearest(mask, size)
         # The last layer is linear, so hidden activations are composited and divided by coverage.
         known = carried.isfinite().all(1, keepdim=True)
         hidden = torch.where(known, decoder.hidden(torch.where(known, carried, 0.0)), 0.0)
@@ -274,19 +159,8 @@ class Lang3DXLModel(RenderingModel):
     # ── checkpoints ─────────────────────────────────────────────────────────────────────────────────
 
     def load_state_dict(self, state: Mapping[str, Any], **kwargs):  # type: ignore[override]
-        """Load a checkpoint of any number of Gaussians, with or without semantics. Parameters are resized in
-        place: the optimizers hold them, and new ones would never be trained."""
-        match_components(self, state)
-        self.config.sh_degree = isqrt(state["gauss_params.features_rest"].shape[1] + 1) - 1
+        """Load a checkpoint of any number of Gaussians, with or without semantics."""
+        self.run.match(state)
+        self.adopt_parts()
         self.step = self.config.total_steps
-        for name, parameter in self.gauss_params.items():
-            saved = state[f"gauss_params.{name}"]
-            inner = saved.shape[2:] if name == "features_rest" else saved.shape[1:]
-            expected = parameter.shape[2:] if name == "features_rest" else parameter.shape[1:]
-            if inner != expected or saved.shape[:1] != state["gauss_params.means"].shape[:1]:
-                raise UserError(
-                    f"the checkpoint's {name} have the shape {list(saved.shape)}: it is damaged, or from "
-                    "another method; copy it again, or pass a run of ns-train lang3dxl"
-                )
-            parameter.data = torch.zeros(saved.shape, dtype=parameter.dtype, device=parameter.device)
         return super(SplatfactoModel, self).load_state_dict(state, **kwargs)

@@ -1,56 +1,13 @@
-"""Model settings: splatfacto's, the method's schedule, and the semantic components."""
+"""nerfstudio's configuration of the model: training's settings, under splatfacto's names."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from operator import attrgetter
-from typing import Literal
+from dataclasses import dataclass
 
-from nerfstudio.utils.rich_utils import CONSOLE
-
-from lang3dxl_ns.common.checks import check_numbers
-from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.settings_help import showing, without
-from lang3dxl_ns.components.appearance import AppearanceConfig
-from lang3dxl_ns.components.decoders import DecoderConfig
-from lang3dxl_ns.components.downsampler import DownsamplerConfig
-from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
-from lang3dxl_ns.plugin.densification import Densification
 from lang3dxl_ns.plugin.inert_settings import OF_SPLATFACTO
-from lang3dxl_ns.plugin.optimizers import log_linear, run_length_weight
 from lang3dxl_ns.plugin.splatfacto import SplatfactoModelConfig
-
-SHORT_FIELD_RUN = 5_000
-"""Iterations below which a run that trains the field with the scene uses its `short` preset, since the
-published grid has learned no words after 300. `auto` of `codes_from` and of the looks' grid use this too."""
-START_OF_CODES = 0.25
-"""Fraction of the run after which codes start from photos; the paper's densification is over by then."""
-
-
-_BOUNDS: dict[str, tuple[float, float]] = {
-    **{"max_gaussians": (0, 1e9), "sky_gaussians": (0, 1e7), "num_random": (4, 1e9)},
-    **{"sh_degree": (0, 3), "random_scale": (1e-9, 1e9), "cull_alpha_thresh": (0, 0.5)},
-    **dict.fromkeys(("densify_from", "densify_until", "densify_every", "semantic_ramp"), (0, 1)),
-    **dict.fromkeys(
-        ("clip_weight", "dense_weight", "region_weight", "densify_grad_thresh", "warm_up"), (0, 1e6)
-    ),
-    "ssim_lambda": (0, 1),
-}
-"""Smallest and largest values of settings."""
-_OF_PARTS: dict[str, dict[str, tuple[float, float]]] = {
-    "semantic_field": {
-        **{"code_std": (0, 1e3), "fourier_frequencies": (0, 32), "levels": (0, 64)},
-        **{"features_per_level": (1, 256), "log2_table_size": (3, 30), "min_resolution": (3, 1e6)},
-        **{"max_resolution": (3, 1e6), "hidden_width": (1, 1e5)},
-    },
-    "downsampler": {"hidden": (0, 1e5), "logit_bound": (0.01, 1e4)},
-    "appearance": {"vector_dim": (1, 1e4)},
-    "decoder.compression": {
-        **{"steps": (1, 1e6), "batch": (1, 1e7), "sample": (1, 1e8)},
-        **{"code_rate": (0, 100), "field_rate": (0, 100)},
-    },
-}
-"""The same for the settings of components."""
+from lang3dxl_ns.training.settings import TrainingSettings
 
 
 @without(*OF_SPLATFACTO)
@@ -60,126 +17,8 @@ _OF_PARTS: dict[str, dict[str, tuple[float, float]]] = {
     *("densify_grad_thresh", "ssim_lambda", "background_color", "clip_weight", "dense_weight"),
 )
 @dataclass
-class ModelSettings(SplatfactoModelConfig):
-    """Splatfacto's settings, with the method's schedule and the semantic components."""
+class ModelSettings(TrainingSettings, SplatfactoModelConfig):  # type: ignore[misc]
+    """Settings of training, and of splatfacto where this package has none of its own."""
 
-    decoder: DecoderConfig = field(default_factory=DecoderConfig)
-    """Feature decoder: the semantic field, or a baseline."""
-    semantic_field: SemanticFieldConfig = field(default_factory=SemanticFieldConfig)
-    """Settings of the field that decodes a 3-number code to CLIP and dense features."""
-    downsampler: DownsamplerConfig = field(default_factory=DownsamplerConfig)
-    """Settings of the training-only network that reduces decoded features to the CLIP target's grid."""
-    appearance: AppearanceConfig = field(default_factory=AppearanceConfig)
-    """Settings of colors that depend on each photo's lighting."""
-    clip_weight: float = 1.0
-    """Weight of the CLIP loss, a mean absolute difference."""
-    dense_weight: float | None = None
-    """Weight of the dense (DINO) loss. None: 2 in short runs, falling to 0.5 in long ones."""
-    region_weight: float = 5e-4
-    """Weight of the loss on feature variance inside regions, if the scene has regions."""
-    decode_size: tuple[int, int] | None = None
-    """Range of the longer side in pixels, inclusive, at which the code map is decoded; five sizes in it are
-    used. None: 56 to 72 in short runs, growing to 80 to 120 (the paper's) in long ones."""
-    semantic_ramp: float = 0.5
-    """Fraction of the run over which the weight of the CLIP and dense losses rises from 0.1 to 1."""
-    warm_up: float = 0.0
-    """Fraction of the run that trains only colors, before the semantic losses start."""
-    codes_from: Literal["auto", "noise", "photos"] = "noise"
-    """Start of codes and field when the warm-up is over. `noise`: random, as published. `photos`: the photos'
-    features, gathered onto the Gaussians; a warm-up of 0 then becomes a quarter of the run. `auto`: `photos`
-    in runs of under 5,000 iterations."""
-    feature_gradient_to_geometry: bool = False
-    """Let the semantic losses also move Gaussians, as in the authors' code; opacities still follow the colors
-    alone."""
-    view_dependence: Literal["auto", "on", "off"] = "auto"
-    """Let colors depend on the viewing direction (spherical harmonics of `sh_degree`). `off` leaves one color
-    and a quarter of the numbers per Gaussian. `auto` decides by measuring the scene."""
-    camera_optimization: Literal["auto", "on", "off"] = "auto"
-    """Refine the cameras during training. `auto`: if the COLMAP model's reprojection error is large."""
-    rasterizer: Literal["auto", "gsplat", "torch"] = "auto"
-    """Rasterizer on a GPU. `auto`: gsplat, which is built at its first use (docs/gpu.md), or, if the build
-    fails, torch, which is many times slower."""
-    max_gaussians: int | None = None
-    """Most Gaussians that densification makes; above it, the least opaque are removed. None: what the GPU's
-    (or the machine's) memory holds. 0: no limit."""
-    sky_gaussians: int = 2_000
-    """Number of Gaussians on a sphere around the scene for the sky and the far distance, where a COLMAP model
-    has no points. 0: none. If photos share one lighting, their colors are one smooth function."""
-    total_steps: int = 30_000
-    """Iterations of the run, to which the fractions refer. The trainer sets it."""
-    densify_from: float = 1 / 15
-    """Fraction of the run at which densification starts (the paper: 2,000 of 30,000)."""
-    densify_until: float = 0.5
-    """Fraction of the run at which densification ends."""
-    densify_every: float = 1 / 15
-    """Fraction of the run between two densification steps (the paper: every 2,000)."""
-    background_color: Literal["random", "black", "white"] = "black"
-    """Color behind the scene. Black, as in the paper: where nothing is rendered, the code is zero too."""
     num_downscales: int = 0
     """Always 0, since photos already vary in size."""
-    ssim_lambda: float = 0.5
-    """Weight of 1 − SSIM relative to L1 in the color loss."""
-    cull_alpha_thresh: float = 0.005
-    """Opacity below which Gaussians are pruned."""
-    densify_grad_thresh: float | None = None  # type: ignore[assignment]
-    """Screen-space gradient (image = [−1, 1]) above which Gaussians are split or duplicated. None: 2e-3 in
-    short runs, which densify while gradients are still large, falling to 2e-4 (the paper's) in long ones."""
-
-    def check(self) -> None:
-        """Raise UserError if a setting is out of its range."""
-        check_numbers(self, _BOUNDS, "--pipeline.model.")
-        for part, bounds in _OF_PARTS.items():
-            check_numbers(attrgetter(part)(self), bounds, f"--pipeline.model.{part.replace('_', '-')}.")
-        smallest, largest = self.decode_size or (1, 1)
-        if not 1 <= smallest <= largest <= 4096:
-            raise UserError(
-                f"--pipeline.model.decode-size is {smallest} {largest}: give a range in 1 to 4096"
-            )
-
-    def fit_to_run(self, iterations: int) -> None:
-        """Resolve settings that depend on the length of the run. Numbers change gradually between short and
-        long runs (`optimizers.run_length_weight`)."""
-        x = run_length_weight(iterations)
-        self.total_steps = iterations
-        if self.semantic_field.preset == "auto":
-            # Compression is a direct regression and does not depend on the run's length.
-            compressed = self.decoder.name == "gathered"
-            preset = "short" if compressed or iterations < SHORT_FIELD_RUN else "paper"
-            self.semantic_field.preset = preset  # type: ignore[assignment]
-            if self.decoder.name == "paper":
-                CONSOLE.log(
-                    f"Semantic field: preset {preset} (short in runs of under {SHORT_FIELD_RUN:,} "
-                    "iterations, paper, as printed, in longer ones)"
-                )
-        if self.codes_from == "auto":
-            self.codes_from = "photos" if iterations < SHORT_FIELD_RUN else "noise"
-        if self.codes_from == "photos" and not self.warm_up:
-            self.warm_up = START_OF_CODES
-        if self.appearance.preset == "auto":
-            self.appearance.preset = "coarse" if iterations < SHORT_FIELD_RUN else "paper"
-        self.semantic_field.resolved()  # a combination that is impossible is told before the work
-        self.downsampler = self.downsampler.resolved(self.semantic_field.preset)
-        if self.densify_grad_thresh is None:
-            self.densify_grad_thresh = log_linear(x, 2e-3, 2e-4)
-        if self.dense_weight is None:
-            self.dense_weight = log_linear(x, 2.0, 0.5)
-        if self.decode_size is None:
-            self.decode_size = (round(56 + 24 * x), round(72 + 48 * x))
-
-
-def make_strategy(config: ModelSettings) -> Densification:
-    """Build the densification with the run's schedule."""
-    steps = config.total_steps
-    assert config.densify_grad_thresh is not None  # set by `fit_to_run`
-    return Densification(
-        prune_opa=config.cull_alpha_thresh,
-        grow_grad2d=config.densify_grad_thresh,
-        grow_scale3d=config.densify_size_thresh,
-        refine_start_iter=round(config.densify_from * steps),
-        refine_stop_iter=round(config.densify_until * steps),
-        refine_every=max(round(config.densify_every * steps), 1),
-        # The paper does not reset opacities in a run of 70,000 iterations.
-        reset_every=10**9,
-        pause_refine_after_reset=0,
-        verbose=False,
-    )

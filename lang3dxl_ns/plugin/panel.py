@@ -82,7 +82,7 @@ class AskPanel(ViewerControl):
             self._pipeline.scene_file,
             viewer.log_filename.parent,
             viewer.train_lock or nullcontext(),
-            learning=lambda: viewer.trainer is not None and viewer.trainer.training_state != "completed",
+            learning=lambda: _changes(viewer.trainer),
             learn=self._pipeline.learn_words,
             shown=self._outputs_shown,
             watch=self._say,
@@ -208,3 +208,10 @@ def stand_of(
     half_width = max(k[0, 2], camera.width - k[0, 2]) / k[0, 0]
     fov = 2 * math.atan(max(half_height, half_width / aspect))
     return position, position + max(ahead, 0.05) * forward, fov
+
+
+def _changes(trainer: Any) -> bool:
+    """Return whether training still changes its model; None: there is no training."""
+    if trainer is None or trainer.training_state == "completed":
+        return False
+    return not getattr(trainer, "has_final_words", False)

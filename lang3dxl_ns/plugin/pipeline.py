@@ -74,10 +74,11 @@ class Lang3DXLPipeline(VanillaPipeline):
 
     def get_train_loss_dict(self, step: int):
         """Compute outputs, losses and metrics of the next photo; codes that start from photos come first."""
-        if self.model.codes_begin:
-            if self.model.config.codes_from == "photos":
+        run = self.model.run
+        if run.codes_begin:
+            if run.settings.codes_from == "photos":
                 self.learn_words()
-            self.model.codes_have_begun = True
+            run.codes_have_begun = True
         outputs, losses, metrics = super().get_train_loss_dict(step)
         self.last_losses = {name: loss.detach() for name, loss in losses.items()}
         return outputs, losses, metrics
@@ -109,7 +110,7 @@ class Lang3DXLPipeline(VanillaPipeline):
     @property
     def has_words_to_learn(self) -> bool:
         """Whether semantics are learned after the last iteration instead of from renderings."""
-        return self.model.semantic_field is not None and self.model.semantic_field.needs_lifting
+        return self.model.run.learns_words_at_the_end
 
     def learn_words(self) -> None:
         """Gather the training photos' features onto the present Gaussians, and learn codes."""

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lang3dxl_ns.common.errors import DAMAGE, UserError
+from lang3dxl_ns.common.errors import DAMAGE, UserError, not_of_memory
 from lang3dxl_ns.common.files import check_regular
 
 NOT_A_CHECKPOINT = (*DAMAGE, pickle.UnpicklingError)
@@ -34,6 +34,7 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
         check_regular(path)
         state = torch.load(path, map_location="cpu", weights_only=True)
     except NOT_A_CHECKPOINT as error:
+        not_of_memory(error)
         raise _no_checkpoint(path, error) from error
     shape = {"pipeline": dict, "step": int}
     if not isinstance(state, dict) or not all(isinstance(state.get(k), v) for k, v in shape.items()):

@@ -24,24 +24,25 @@ from nerfstudio.utils import writer
 from nerfstudio.utils.decorators import check_main_thread
 from nerfstudio.utils.rich_utils import CONSOLE
 from rich.markup import escape
-from torch import Tensor
 from torch.cuda.amp.grad_scaler import GradScaler
 
 from lang3dxl_ns.common.console import say, some
 from lang3dxl_ns.common.device import multiplies_bfloat16
-from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.errors import UserError, not_of_memory
 from lang3dxl_ns.common.files import expanded, replace_durably
 from lang3dxl_ns.common.memory import ran_out_of_memory
 from lang3dxl_ns.common.reports import synchronize
 from lang3dxl_ns.common.stages import Stages, roughly
 from lang3dxl_ns.files.scene_file import SUFFIX, Provenance, replace_scene
-from lang3dxl_ns.plugin.optimizers import GuardedOptimizers, add_rows_to_state
+from lang3dxl_ns.plugin.optimizers import GuardedOptimizers
 from lang3dxl_ns.plugin.pipeline import Lang3DXLPipeline
 from lang3dxl_ns.plugin.run_checkpoint import NOT_A_CHECKPOINT, check_checkpoint, read_checkpoint
-from lang3dxl_ns.plugin.sizes import plan
 from lang3dxl_ns.preparation.needs import NEEDS_FILE, write_needs
 from lang3dxl_ns.preparation.store import PhotosGoneError
 from lang3dxl_ns.scene.record import SCENE_FILE, SceneRecord
+from lang3dxl_ns.training.learn_codes import forget_words
+from lang3dxl_ns.training.learning_rates import add_rows_to_state
+from lang3dxl_ns.training.memory import plan
 from lang3dxl_ns.training.step_guard import StepGuard
 
 RENDERINGS_PER_STEP = {False: 3.0, True: 4.0}
@@ -159,7 +160,7 @@ class Lang3DXLTrainer(Trainer):
                 write_needs(self.pipeline.datamanager.needs, self.base_dir)
         model, cameras = self.pipeline.model, self.pipeline.datamanager.train_dataset.cameras
         pixels, wanted = int((cameras.width * cameras.height).max()), self.config.pipeline.model.max_gaussians
-        model.strategy.most, message = plan(model, pixels, torch.device(self.device), wanted)
+        model.run.densification.most, message = plan(model.run, pixels, torch.device(self.device), wanted)
         CONSOLE.log(escape(message))
         torch.manual_seed(self.config.machine.seed)
         if self._run_state is not None:
@@ -201,6 +202,7 @@ class Lang3DXLTrainer(Trainer):
                 self.grad_scaler.load_state_dict(state["scalers"])
             self._run_state, self.words_are_learned = state["run"], state["words"]
         except NOT_A_CHECKPOINT as error:
+            not_of_memory(error)
             raise UserError(
                 f"{path} is not a checkpoint of lang3dxl ({error}): give --load-dir the "
                 "nerfstudio_models folder of a run, or --load-checkpoint one of its step-….ckpt files"
@@ -252,8 +254,8 @@ class Lang3DXLTrainer(Trainer):
         )
         # Densification accumulates the gradients of screen positions, which are just as broken, and scaled
         # alike.
-        self.pipeline.model.step_is_sound = sound
-        self.pipeline.model.strategy.loss_scale = scale
+        self.pipeline.model.run.step_is_sound = sound
+        self.pipeline.model.run.densification.loss_scale = scale
         return sound
 
     @property
@@ -262,6 +264,11 @@ class Lang3DXLTrainer(Trainer):
         words = self.words_are_learned or not self.pipeline.has_words_to_learn
         beyond = self._start_step - self.config.max_num_iterations
         return beyond > 0 or (beyond == 0 and words)
+
+    @property
+    def has_final_words(self) -> bool:
+        """Whether the words of the run's end are learned: from then on the model stays as it is."""
+        return self._is_ending and self.words_are_learned
 
     def train(self) -> None:
         """Train up to `max_num_iterations` in total (nerfstudio would add that many to a resumed run), then
@@ -282,7 +289,7 @@ class Lang3DXLTrainer(Trainer):
         self.step = max(self._last_iteration, 0)
         if self._start_step < total:
             self.words_are_learned = False  # the checkpoint's words will be out of date
-            self.pipeline.model.forget_gathered_codes()
+            forget_words(self.pipeline.model.run)
         try:
             self._announce_time()
             writer.GLOBAL_BUFFER.setdefault("step", self.step)  # the end reads it, also without any step
@@ -321,7 +328,7 @@ class Lang3DXLTrainer(Trainer):
             rendering = median(times)
             model.train()
         count, decoder = self.config.max_num_iterations, model.semantic_field
-        seconds, words = rendering * count * RENDERINGS_PER_STEP[model.learns_from_renderings], 0.0
+        seconds, words = rendering * count * RENDERINGS_PER_STEP[model.run.learns_from_renderings], 0.0
         line = f"training: {roughly(seconds)} for {count:,} iterations"
         if decoder is not None and decoder.needs_lifting:
             words = rendering * len(cameras) * RENDERINGS_PER_PHOTO
@@ -478,26 +485,11 @@ class Lang3DXLTrainer(Trainer):
 
 
 def _run_state(pipeline: Lang3DXLPipeline) -> dict[str, Any]:
-    """Collect densification statistics, whether codes have begun, the current round through the photos, and
-    the random generators' states, all in types that torch's weights-only loader accepts."""
-    return {
-        "strategy": {k: v for k, v in pipeline.model.strategy_state.items() if k != "rendered"},
-        "codes_have_begun": pipeline.model.codes_have_begun,
-        "photos": pipeline.datamanager.round_state(),
-        "random": torch.get_rng_state(),
-        "random_cuda": torch.cuda.get_rng_state_all() if torch.cuda.is_available() else [],
-    }
+    """Collect the run's progress and the current round through the photos."""
+    return pipeline.model.run.progress() | {"photos": pipeline.datamanager.round_state()}
 
 
 def _restore(pipeline: Lang3DXLPipeline, state: dict[str, Any]) -> None:
     """Restore `_run_state` on the pipeline's device, whichever device it was saved from."""
-    model = pipeline.model
-    model.strategy_state = {
-        name: value.to(model.device) if isinstance(value, Tensor) else value
-        for name, value in state["strategy"].items()
-    }
-    model.codes_have_begun = state["codes_have_begun"]
     pipeline.datamanager.restore_round(state["photos"])
-    torch.set_rng_state(state["random"])
-    if torch.cuda.is_available() and len(state["random_cuda"]) == torch.cuda.device_count():
-        torch.cuda.set_rng_state_all(state["random_cuda"])
+    pipeline.model.run.restore(state)

@@ -232,7 +232,7 @@ def load_image_text_encoder(name_or_dir: str | Path, device: torch.device | str)
             _tokenizer(files),
             processor.image_mean if normalizes else (0.0, 0.0, 0.0),
             processor.image_std if normalizes else (1.0, 1.0, 1.0),
-            files.identity,
+            files.clip_identity,
             getattr(processor, "brightness", None),  # a key of our own, in the built-in CLIP's folder
             "bilinear" if int(processor.resample) == 2 else "bicubic",
             read_patch_head(files.folder, device),

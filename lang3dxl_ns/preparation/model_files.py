@@ -6,6 +6,8 @@ Code that comes with a model is never run, and weights are read as plain tensors
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
 from functools import lru_cache, partial
@@ -30,6 +32,8 @@ option_prefix: ContextVar[str] = ContextVar("option_prefix", default=_PREFIX)
 _DEMO = Path(__file__).parents[1] / "demo"
 _BUILTIN_FOLDERS = {CLIP_OPTION: _DEMO / "clip", DENSE_OPTION: _DEMO / "dense"}
 _WEIGHTS = ("model*.safetensors", "pytorch_model*.bin")  # the first that exists is used
+_TOKENIZER = ("tokenizer.json", "vocab.json", "merges.txt", "*.model")
+"""Files that decide how a text becomes tokens."""
 _FILES = ("*.json", "*.txt", "*.model")
 """Patterns of configuration, vocabularies, and SentencePiece models."""
 _MOST_LAYERS = 1000
@@ -46,6 +50,14 @@ class ModelFiles:
     """Fingerprint of configuration and weights, not of the name, so targets stay valid if the model moves."""
     option: str
     """Command-line option that chose the model, for messages."""
+
+    @property
+    def clip_identity(self) -> str:
+        """Fingerprint of a CLIP: `identity` and, after a dot, that of its tokenizer, on which the vectors of
+        texts depend but no target does."""
+        files = sorted(path for name in _TOKENIZER for path in self.folder.glob(name))
+        digests = [_digest(path, path.stat().st_size, path.stat().st_mtime_ns) for path in files]
+        return f"{self.identity}.{hashlib.sha256(''.join(digests).encode()).hexdigest()[:16]}"
 
     @property
     def address(self) -> str:
@@ -110,6 +122,16 @@ def check_encoders(clip: str, dense: str) -> None:
 def spoken(option: str) -> str:
     """Return an option as spelled in the current command."""
     return option.replace(_PREFIX, option_prefix.get())
+
+
+@contextmanager
+def short_options() -> Iterator[None]:
+    """Spell options in messages without their prefix in `ns-train`, until the block or function ends."""
+    token = option_prefix.set("--")
+    try:
+        yield
+    finally:
+        option_prefix.reset(token)
 
 
 def load_weights(model_class: Any, files: ModelFiles, device: torch.device | str) -> Any:

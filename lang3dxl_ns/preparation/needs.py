@@ -53,6 +53,9 @@ class Need:
         return "needed" if self.needed else "left out"
 
 
+_DENSE = "a dense encoder is given, which sharpens words"
+
+
 def scene_needs(
     photos: Sequence[Photo], reconstruction: Reconstruction, crops: CropPlan, dense: bool, regions: bool
 ) -> list[Need]:
@@ -78,8 +81,8 @@ def scene_needs(
             f"distinct pyramid levels per photo, mean over the photos, of {len(crops.scales)}", levels, 1.0,
         ),
         _foreground(photos),
-        Need("regions", regions, "a source of regions is given", None, None),
-        Need("dense features", dense, "a dense encoder is given: it sharpens words", None, None),
+        Need("regions", regions, f"{'a' if regions else 'no'} source of regions is given", None, None),
+        Need("dense features", dense, _DENSE if dense else f"no {_DENSE[2:]}", None, None),
         _measured(
             "camera optimizer", "reprojection error of the model (pixels, median over the photos)",
             float(np.median(errors)) if errors else None, REPROJECTION, unmeasured=False,

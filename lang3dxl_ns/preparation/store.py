@@ -9,7 +9,7 @@ import json
 import logging
 import re
 import time
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -17,9 +17,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lang3dxl_ns.common.console import tracked
+from lang3dxl_ns.common.console import say, tracked
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.common.files import read_json, write_atomically
+from lang3dxl_ns.common.files import read_json, replace_file
 from lang3dxl_ns.scene.photo import Photo
 
 logger = logging.getLogger(__name__)
@@ -67,8 +67,10 @@ class FeatureStore:
 
     def write_bytes(self, path: Path, content: bytes, what: str) -> None:
         """Write a file of the store atomically. Raises UserError if the disk is full or read-only."""
+        if path.parent.is_symlink():
+            raise UserError(f"{path.parent} is a link, perhaps into another scene's targets: remove it")
         with self._writable(what):
-            write_atomically(path, content)
+            replace_file(path, content)
 
     def make_folder(self) -> None:
         """Create the store's folder. Raises UserError if the disk is full or read-only."""
@@ -158,31 +160,43 @@ class FeatureStore:
                     found[photo.name] = recorded
         if any(known.get(name) != entry for name, entry in found.items()):
             with contextlib.suppress(OSError):  # a store that can't be written to can still be read
-                write_atomically(path, json.dumps({**known, **found}))
+                replace_file(path, json.dumps({**known, **found}))
         return hashes
 
     def sizes(self) -> dict[str, tuple[int, int]]:
         """Count the files and bytes on disk, by kind."""
         sizes = {}
-        for folder in sorted(path for path in self.root.glob("*") if path.is_dir()):
+        for folder in self._kinds():
             files = [path for path in folder.iterdir() if _ENTRY.fullmatch(path.name)]
             sizes[folder.name] = (len(files), sum(path.stat().st_size for path in files))
         return sizes
 
-    def clean(self, kinds: Collection[str], names: Iterable[str]) -> tuple[int, int]:
-        """Delete all entries except those of these kinds and photos, and return their number and bytes."""
+    def _kinds(self) -> list[Path]:
+        """List the folders of entries. Links may lead into another scene's targets, and are left out."""
+        return sorted(path for path in self.root.glob("*") if path.is_dir() and not path.is_symlink())
+
+    def clean(self, kinds: Collection[str], names: Collection[str], shared: bool = False) -> tuple[int, int]:
+        """Delete all entries except those of these kinds and photos, and return their number and bytes. Of a
+        `shared` folder, entries of other photos stay, since they may be another scene's, and are told of."""
         self.remove_leftovers()
         keep = {self.path(kind, name).with_suffix("") for name in names for kind in kinds}
-        files, freed = 0, 0
-        for path in self.root.glob("*/*"):
-            if _ENTRY.fullmatch(path.name) and path.with_suffix("") not in keep:
+        own = {self.path("", name).stem for name in names}
+        files, freed, left = 0, 0, 0
+        for path in (path for folder in self._kinds() for path in folder.iterdir()):
+            if not _ENTRY.fullmatch(path.name) or path.with_suffix("") in keep:
+                continue
+            if shared and path.stem not in own:
+                left += 1
+            else:
                 files, freed = files + 1, freed + path.stat().st_size
                 path.unlink()
+        if left:
+            say(f"{left} entries of other photos stay, since another scene may use {self.root}")
         return files, freed
 
     def remove_leftovers(self) -> None:
         """Delete temporary files of processes that were killed while writing."""
-        for path in self.root.glob("*/*-????????.tmp"):
+        for path in (path for folder in self._kinds() for path in folder.glob("*-????????.tmp")):
             with contextlib.suppress(FileNotFoundError):  # another process may clean up too
                 if time.time() - path.stat().st_mtime > _LEFTOVER_AGE_S:
                     path.unlink()

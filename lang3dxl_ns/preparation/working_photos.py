@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import json
 import math
-from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +13,7 @@ from jaxtyping import Bool, UInt8
 from PIL import Image, PngImagePlugin
 from torch import Tensor
 
+from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.pictures import NoPictureError, open_picture
 from lang3dxl_ns.preparation.store import FeatureStore
@@ -39,6 +39,7 @@ class WorkingPhotos:
 
     def __init__(self, store: FeatureStore) -> None:
         self._store = store
+        self._told = False
 
     def read(self, photo: Photo, scale: float = 1.0) -> UInt8[Tensor, "h w 3"]:
         """Read a photo like `Photo.read_uint8`. It raises UserError likewise, even for a file with a copy."""
@@ -69,9 +70,14 @@ class WorkingPhotos:
         return _resized(image, photo, scale, Image.Resampling.NEAREST)
 
     def _keep(self, path: Path, content: bytes) -> None:
-        """Write a copy. Without space or permission it is not written, and the photo is decoded each time."""
-        with suppress(UserError):
+        """Write a copy. Without space or permission it is not written, and the photo is decoded each time; a
+        message tells so once."""
+        try:
             self._store.write_bytes(path, content, path.name)
+        except UserError as error:
+            if not self._told:
+                self._told = True
+                say(f"Large photos are decoded anew in every round, which is slow: {error}")
 
 
 def mask_png(mask: Bool[Tensor, "h w"], made_with: str) -> bytes:

@@ -19,6 +19,7 @@ from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import expanded, write_atomically
 from lang3dxl_ns.query.heat_maps import overlay, tinted, with_legend
 from lang3dxl_ns.query.text import Prompt
+from lang3dxl_ns.query.trust import Trust
 from lang3dxl_ns.query.view_ranking import Box, Viewpoint
 from lang3dxl_ns.rendering import Rendering
 from lang3dxl_ns.scene.camera import Camera
@@ -73,6 +74,8 @@ class Match:
     doubt: float
     """Share of unrelated words that match the scene as well. Above 0.04 (0.1 for a taught word) the scene
     probably does not show the prompt, or CLIP does not know it."""
+    trust: Trust
+    """How far to believe the answer, in one word with its reason."""
     view: View
     relevancy: Float[Array, "h w"]
     """Relevancy of every pixel, 0…1: above 0.5 where the prompt beats all competitors; 0 where nothing is."""
@@ -125,8 +128,8 @@ class Match:
 def together(matches: Sequence[Match]) -> UInt8[Array, "h+legend w 3"]:
     """Draw several prompts in one view, each in its own color, the strongest where they overlap, with a
     legend below. Raises UserError if there is no match, or the matches are of different views."""
-    places = {(match.view.pixels.shape, str(match.view.camera.view_matrix.tolist())) for match in matches}
-    if len(places) != 1:
+    first = matches[0].view.camera if matches else None
+    if first is None or not all(match.view.camera.same_as(first) for match in matches):
         raise UserError("one picture shows the prompts of one view: pass the matches of a single query")
     maps = torch.stack([torch.from_numpy(match.relevancy) for match in matches])
     masks = torch.stack([torch.from_numpy(match.mask) for match in matches])
@@ -150,6 +153,8 @@ class Found:
     """Which Gaussians match; the masks of views show the same selection in 2D."""
     doubt: float
     """Share of unrelated words that match the scene as well, see `Match.doubt`."""
+    trust: Trust
+    """How far to believe the answer, in one word with its reason."""
     threshold: float
     """Relevancy above which Gaussians match."""
 

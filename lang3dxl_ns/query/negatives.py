@@ -49,6 +49,11 @@ CLEAR = 0.6
 """Relevancy above which a word still names a place where one of `NOTHING` is the closest negative."""
 
 
+def alternatives(phrase: str) -> frozenset[str]:
+    """Return the synonyms and parts of a phrase among the negatives."""
+    return _NAMED.get(phrase, frozenset())
+
+
 def competitors(phrases: Sequence[str], words: Sequence[str]) -> list[int]:
     """Return the indices of the phrases that a prompt competes with: those that neither it nor its synonyms
     (`words`) name, by any of their words or the synonyms of these, singular or plural. If all phrases are

@@ -6,7 +6,7 @@ restriction to a foreground are therefore decided here and nowhere else.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import torch
@@ -22,6 +22,7 @@ from lang3dxl_ns.query.heat_maps import overlay, strongest
 from lang3dxl_ns.query.relevancy import TEMPERATURE, Queries
 from lang3dxl_ns.query.text import Prompt, TextConfig
 from lang3dxl_ns.query.thresholds import matching
+from lang3dxl_ns.query.trust import Trust
 from lang3dxl_ns.rendering import Rendering
 
 COVERED = 0.3
@@ -51,8 +52,8 @@ class QueryConfig:
     min_alpha: float = 0.3
     """Coverage below which a pixel cannot match."""
     foreground: str = ""
-    """Restrict matches in views without a mask to what this prompt finds, such as `building`. The view of a
-    photo with a foreground mask is always restricted to that mask."""
+    """Restrict matches to what this prompt finds, such as `building`. The view of a photo with a foreground
+    mask is restricted to that mask as well."""
     size: int | None = None
     """Longer side of pictures in pixels. Default: the photo's own, at most 1920."""
     views: int = 100
@@ -77,6 +78,8 @@ class Question:
     """Relevancy of every Gaussian to all of these."""
     doubts: tuple[float, ...] = ()
     """Share of unrelated words that match the scene as well, one per prompt."""
+    trusts: tuple[Trust, ...] = ()
+    """How far to believe the answers, one per prompt."""
     thresholds: tuple[float, ...] = ()
     """Relevancy above which Gaussians match, one per prompt."""
     foreground_thresholds: tuple[float, ...] = ()
@@ -102,6 +105,20 @@ class Question:
     def gaussians(self) -> Bool[Tensor, "q n"]:
         """Mask of the Gaussians that match each prompt."""
         return matching(self.relevancy, self.thresholds)
+
+    def alone(self, row: int) -> Question:
+        """Return the question of one of these prompts."""
+        count, one = len(self.prompts), slice(row, row + 1)
+        rows = [row, *range(count, len(self.everywhere))]
+        return replace(
+            self,
+            prompts=self.prompts[one],
+            queries=self.queries.select(rows),
+            everywhere=self.everywhere[rows],
+            doubts=self.doubts[one],
+            trusts=self.trusts[one],
+            thresholds=self.thresholds[one],
+        )
 
     @torch.no_grad()
     def maps(

@@ -5,11 +5,10 @@ from __future__ import annotations
 import copy
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import suppress
-from dataclasses import KW_ONLY, asdict, dataclass, field, replace
+from dataclasses import KW_ONLY, dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, TypeVar, overload
 
 import numpy as np
 import torch
@@ -17,38 +16,33 @@ from jaxtyping import Bool, Float
 from numpy import ndarray as Array
 from torch import Tensor
 
-from lang3dxl_ns.common.console import say_once, tracked
+from lang3dxl_ns.common.console import say_once
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import expanded
 from lang3dxl_ns.components.appearance import AppearanceField, Look, render_in_look
 from lang3dxl_ns.components.feature_decoder import Decoder
-from lang3dxl_ns.files.splat_file import write_index, write_splats
+from lang3dxl_ns.files.matching_splat import write_matching
+from lang3dxl_ns.files.splat_file import write_splats
 from lang3dxl_ns.preparation.encoders import load_image_text_encoder
-from lang3dxl_ns.query.doubt import DOUBTFUL, Doubts, doubtful
+from lang3dxl_ns.query import answer
+from lang3dxl_ns.query.answering import Place
+from lang3dxl_ns.query.doubt import DOUBTFUL, Doubts, doubtful, peaks
 from lang3dxl_ns.query.engine import QueryEngine, make_engine
+from lang3dxl_ns.query.floaters import FLOATS, floating
 from lang3dxl_ns.query.match import Found, Match, View
-from lang3dxl_ns.query.negatives import CLEAR, NOTHING
 from lang3dxl_ns.query.question import QueryConfig, Question
 from lang3dxl_ns.query.relevancy import Queries
-from lang3dxl_ns.query.text import (
-    EncodeTexts,
-    Prompt,
-    TextEncoder,
-    listed_phrases,
-    parse_prompts,
-    taught_prompt,
-    texts_of,
-)
-from lang3dxl_ns.query.thresholds import match_thresholds
-from lang3dxl_ns.query.view_ranking import Viewpoint, rank_views, strongest_match
-from lang3dxl_ns.query.visibility import VisibleGaussians, fingerprint, load_visible, save_visible, spread
-from lang3dxl_ns.query.vocabulary import searched, shipped_vocabulary
+from lang3dxl_ns.query.text import EncodeTexts, Prompt, TextEncoder, listed_phrases, parse_prompts, texts_of
+from lang3dxl_ns.query.thresholds import match_thresholds, matching
+from lang3dxl_ns.query.trust import ANCHORS, alike, foreignness, judged
+from lang3dxl_ns.query.visibility import VisibleGaussians, measured, median_distance, total_pixels
+from lang3dxl_ns.query.vocabulary import closest_word, common_words, searched, shipped_vocabulary
 from lang3dxl_ns.rendering import Backend, Rendering, Splats, composite
 from lang3dxl_ns.rendering.gathering import filled_pixels
 from lang3dxl_ns.scene.camera import Camera, posed, resized, with_field_of_view, with_longer_side
-from lang3dxl_ns.scene.record import ScenePhoto, SceneRecord, overview
-from lang3dxl_ns.words.learn_word import Weights, learn
+from lang3dxl_ns.scene.record import ScenePhoto, SceneRecord, overview, same_clip
 from lang3dxl_ns.words.taught_words import Example, TaughtWord, known_word
+from lang3dxl_ns.words.teach import carried_word, learned_word, least_certain_photo
 
 _ROWS = 65_536
 """Number of Gaussians decoded at a time."""
@@ -57,8 +51,6 @@ LARGEST = 1920
 NO_SEMANTICS = "this scene has colors alone (it was trained with clip none): it can't be queried"
 Text: TypeAlias = str | Prompt | Float[Tensor, " c"] | Float[Array, " c"]
 """A text as `parse_prompts` reads it, or a vector in the space of the scene's CLIP."""
-Place: TypeAlias = Camera | str | Float[Tensor, "rows 4"] | Float[Array, "rows 4"]
-"""A camera, a photo's name, or a pose (camera → world in the model's frame, nerfstudio's axes)."""
 
 
 @dataclass(eq=False, repr=False)
@@ -152,7 +144,7 @@ class Scene:
         """Render the scene from a photo's viewpoint, a camera or a pose; see `camera`. look: training photo
         whose lighting is used; by default the scene's rule chooses for this view. Raises UserError as
         `camera` does, and if there is no look of this photo."""
-        return self._view(self.camera(place, size, fov), self._name(place), look)
+        return self.view(place, self.camera(place, size, fov), look)
 
     def draw(
         self, camera: Camera, channels: Float[Tensor, "n d"] | None = None, look: Look | None = None
@@ -165,15 +157,17 @@ class Scene:
             self.splats, camera, look, channels, background=self.background, backend=self.backend
         )
 
-    def _view(
+    def view(
         self,
+        place: Place,
         camera: Camera,
-        name: str | None,
         look: str | None = None,
         channels: Float[Tensor, "n d"] | None = None,
     ) -> View:
+        """Render the camera of a place, with a training photo's look and further values of the Gaussians."""
         start = time.perf_counter()
         rendering = self.draw(camera, channels, self._look(look))
+        name = self.file.photo(place).name if isinstance(place, str) else None
         return View(rendering, name, time.perf_counter() - start)
 
     def _look(self, photo: str | None) -> Look | None:
@@ -182,9 +176,6 @@ class Scene:
         if self.looks is None:
             raise UserError("all photos of this scene share one lighting: there is no look to choose")
         return self.looks.of_photo(self.file.photo(photo).name)
-
-    def _name(self, place: Place) -> str | None:
-        return self.file.photo(place).name if isinstance(place, str) else None
 
     def baked(self, look: str | None = None) -> Splats:
         """Return the Gaussians with the look of a training photo (default: the overview photo) in their
@@ -239,16 +230,52 @@ class Scene:
                 say_once(f"foreground {prompt.text}: {advice}")
         strict = [bool(prompt.negatives or prompt.taught) for prompt in everything]
         levels = match_thresholds(relevancy, doubts, strict)
+        fits = peaks(relevancy).tolist()
+        trusts = [
+            judged(
+                prompt.text,
+                doubts[i],
+                fits[i],
+                taught=prompt.taught is not None or prompt.vector is not None,
+                foreign=self.foreignness,
+                meant=closest_word(prompt.text, (*self.words, *common_words())),
+                alike=alike(prompt.text, self.synonyms(prompt), relevancy[i] > levels[i], self.anchors),
+            )
+            for i, prompt in enumerate(prompts)
+        ]
         return Question(
             self.engine,
             tuple(prompts),
             queries,
             relevancy,
             tuple(doubts[:count]),
+            tuple(trusts),
             levels[:count] if requested is None else (requested,) * count,
             levels[count:],
             self.config.min_alpha,
         )
+
+    @overload  # a text is a sequence of texts too, and the first form is meant
+    def query(  # type: ignore[overload-overlap]
+        self,
+        texts: Text,
+        place: Place | None = None,
+        *,
+        negatives: Sequence[str] = (),
+        size: int | None = None,
+        threshold: float | None = None,
+    ) -> Match: ...
+
+    @overload
+    def query(
+        self,
+        texts: Sequence[Text],
+        place: Place | None = None,
+        *,
+        negatives: Sequence[str] = (),
+        size: int | None = None,
+        threshold: float | None = None,
+    ) -> list[Match]: ...
 
     def query(
         self,
@@ -258,8 +285,9 @@ class Scene:
         negatives: Sequence[str] = (),
         size: int | None = None,
         threshold: float | None = None,
-    ) -> Any:
-        """Find matches in a view: return a `Match` for one prompt, a list of them for several.
+    ) -> Match | list[Match]:
+        """Find matches in a view: return a `Match` for one text, a list of them for several texts, or for a
+        text that holds several prompts.
 
         Args:
             texts, negatives, threshold: see `ask`.
@@ -271,47 +299,32 @@ class Scene:
             UserError: see `ask` and `camera`.
         """
         question = self.ask(texts, negatives=negatives, threshold=threshold)
-        if place is not None:
-            found = self.matches(question, place, size)
-        else:
-            names = self.best_views(question)
-            questions = [self.ask([p], threshold=threshold) for p in question.prompts]
-            found = [self.matches(q, n, size)[0] for q, n in zip(questions, names, strict=True)]
-        return found if _several(texts, found) else found[0]
+        if place is None:
+            return _one_or_all(texts, answer.best_matches(self, question, size))
+        return _one_or_all(texts, answer.matches(self, question, place, size))
 
     def matches(self, question: Question, place: Place, size: int | None = None) -> list[Match]:
-        """Find matches of a question's prompts in one view; see `query`.
+        """Find matches of a question's prompts in one view; see `query`."""
+        return answer.matches(self, question, place, size)
 
-        Relevancies are composited with at most as many pixels as the training photos have, and enlarged for a
-        larger view: nothing was learned between these pixels, and Gaussians too thin for them would stand out
-        as lines.
-        """
-        start = time.perf_counter()
-        channels = question.channels
-        asked = time.perf_counter()
-        camera, name = self.camera(place, size), self._name(place)
-        small = resized(camera, self.trained_side)
-        enlarged = small.width < camera.width
-        view = self._view(camera, name, channels=None if enlarged else channels)
-        rendered, rendering = time.perf_counter(), view.rendering
-        if enlarged:
-            rendering = replace(rendering, channels=composite(self.splats, small, channels, self.backend))
-        foreground = None if name is None else self.file.photo(name).foreground()
-        maps, masks = question.maps(rendering, foreground)
-        found = maps.cpu().float().numpy(), masks.cpu().numpy()
-        seconds = asked - start + time.perf_counter() - rendered
-        rows = zip(question.prompts, question.doubts, *found, question.thresholds, strict=True)
-        return [
-            Match(prompt, self.synonyms(prompt), doubt, view, relevancy, mask, level, seconds)
-            for prompt, doubt, relevancy, mask, level in rows
-        ]
-
-    @torch.no_grad()
     def relevancy_maps(self, camera: Camera, queries: Queries) -> Float[Tensor, "q h w"]:
         """Compute every pixel's relevancy to every query, 0…1, as it is scored, without a foreground."""
-        rendering = self.draw(camera, self.engine.channels(queries))
-        assert rendering.channels is not None
-        return self.engine.maps(rendering.channels, queries)
+        return answer.relevancy_maps(self, camera, queries)
+
+    @overload
+    def find(  # type: ignore[overload-overlap]
+        self, texts: Text, *, negatives: Sequence[str] = (), threshold: float | None = None, most: int = 10
+    ) -> Found: ...
+
+    @overload
+    def find(
+        self,
+        texts: Sequence[Text],
+        *,
+        negatives: Sequence[str] = (),
+        threshold: float | None = None,
+        most: int = 10,
+    ) -> list[Found]: ...
 
     def find(
         self,
@@ -320,36 +333,23 @@ class Scene:
         negatives: Sequence[str] = (),
         threshold: float | None = None,
         most: int = 10,
-    ) -> Any:
-        """Find matches in the scene: return a `Found` with at most `most` views for one prompt, a list of
-        them for several. For the other arguments see `ask`. Raises UserError as `ask` does, and if `most` is
-        below 1."""
+    ) -> Found | list[Found]:
+        """Find matches in the scene: return a `Found` with at most `most` views for one text, a list of
+        them for several, as `query` does. For the other arguments see `ask`. Raises UserError as `ask` does,
+        and if `most` is below 1."""
         if most < 1:
             raise UserError(f"{most} views are requested: give 1 or more")
-        found = self.places(self.ask(texts, negatives=negatives, threshold=threshold), most)
-        return found if _several(texts, found) else found[0]
+        question = self.ask(texts, negatives=negatives, threshold=threshold)
+        return _one_or_all(texts, answer.locate(self, question, most))
 
     def places(self, question: Question, most: int = 10) -> list[Found]:
         """Find matches of a question's prompts in the scene; see `find`."""
-        found = []
-        for row, prompt in enumerate(question.prompts):
-            scores, threshold = question.relevancy[row], question.thresholds[row]
-            views, box = [view for view in self._ranked(question, row) if view.shown][:most], None
-            if views:
-                box = strongest_match(self.splats.means, scores, self.mass, threshold, self.gap)
-            relevancy, matching = scores.cpu().float().numpy(), question.gaussians[row].cpu().numpy()
-            found.append(Found(prompt, views, box, relevancy, matching, question.doubts[row], threshold))
-        return found
+        return answer.locate(self, question, most)
 
     def best_views(self, question: Question) -> list[str]:
         """Return for each prompt the name of the training photo whose view shows it best, or comes closest.
         Raises UserError if the scene has no training photos."""
-        self._check_views()
-        return [self._ranked(question, row)[0].name for row in range(len(question.prompts))]
-
-    def _check_views(self) -> None:
-        if not self.visible:
-            raise UserError("this scene has no training photos to choose from: name a photo or a camera")
+        return answer.best_views(self, question)
 
     def relevancy(self, text: Text) -> Float[Array, " n"]:
         """Compute the relevancy of every Gaussian to one prompt, 0…1; 0 for Gaussians visible in no photo.
@@ -365,6 +365,7 @@ class Scene:
         everything: bool = False,
         look: str | None = None,
         index: str | Path | None = None,
+        hide_floaters: bool = False,
     ) -> int:
         """Write the Gaussians as a .ply or .spz file for splat viewers, in the scene's order, and return how
         many were written.
@@ -376,65 +377,49 @@ class Scene:
             look: training photo whose lighting is baked into the colors; default: the overview photo.
             index: with a text, a .npy or .txt file for the numbers of the matching Gaussians: their
                 positions, from 0, in the scene, and so in the splat that it was attached to.
+            hide_floaters: leave out the Gaussians that `floating` takes for floaters.
 
         Raises:
             UserError: nothing matches, or see `ask` and `write_splats`.
         """
         splats = self.baked(look)
+        solid = self.floating <= FLOATS if hide_floaters else self.splats.opacities >= 0
         if text is None:
-            return write_splats(expanded(path), splats)
+            return write_splats(expanded(path), splats.select(solid) if hide_floaters else splats)
         question = self._one(text, threshold)
-        relevancy, keep = question.relevancy[0], question.gaussians[0]
-        if not everything and not keep.any():
-            best, level = float(relevancy.max()), question.thresholds[0]
-            raise UserError(
-                f"no Gaussian matches {question.prompts[0].text!r}: the best reaches {best:.2f}; lower "
-                f"--threshold, now {level:.2f}, or write all with their relevancy (--all)"
-            )
-        if not everything:
-            splats, relevancy = splats.select(keep), relevancy[keep]
-        if index is not None:
-            write_index(expanded(index), keep)
-        return write_splats(expanded(path), splats, relevancy)
+        return write_matching(
+            expanded(path), splats, question, everything, index, solid if hide_floaters else None
+        )
 
     # ── what the photos show ────────────────────────────────────────────────────────────────────────
 
     @cached_property
     def visible(self) -> Mapping[str, VisibleGaussians]:
         """The Gaussians visible in each training view. They are measured once, with a progress bar."""
-        count, side = self.config.views, self.config.view_side
-        chosen = spread([photo for photo in self.photos if photo.split == "train"], count)
-        cameras = {photo.name: resized(photo.camera, side) for photo in chosen}
-        key = ""
-        if self.cache is not None:
-            masks = [photo.mask_stamp() for photo in chosen]
-            how = [asdict(self.file), count, side, self.splats.antialiased, masks]
-            key = fingerprint(vars(self.splats.gaussians), how)
-            if (kept := load_visible(self.cache, key, cameras, self.device)) is not None:
-                return kept
-        views, what = dict[str, VisibleGaussians](), "measuring which Gaussians the photos show, once"
-        for name, camera in tracked(cameras.items(), what):
-            if self.watch is not None:
-                self.watch(f"{what}: view {len(views) + 1} of {len(cameras)}")
-            size = camera.height, camera.width
-            mask = self.file.photo(name).foreground(size)
-            weight = torch.ones(size) if mask is None else mask.float()
-            views[name] = VisibleGaussians.of(camera, self._fill(camera, weight.to(self.device)))
-        if self.cache is not None and views:
-            save_visible(self.cache, views, key)
-        return views
+        return measured(
+            self.file,
+            self.splats,
+            self.config.views,
+            self.config.view_side,
+            cache=self.cache,
+            backend=self.backend,
+            watch=self.watch,
+        )
 
-    def _fill(self, camera: Camera, weight: Float[Tensor, "h w"]) -> Float[Tensor, " n"]:
+    def fill(self, camera: Camera, weight: Float[Tensor, "h w"]) -> Float[Tensor, " n"]:
+        """Compute how many of a camera's pixels, each of a weight 0…1, every Gaussian fills."""
         drawn = partial(composite, self.splats, camera, backend=self.backend)
         return filled_pixels(drawn, weight, len(self.splats))
 
     @cached_property
     def mass(self) -> Float[Tensor, " n"]:
         """Pixels that every Gaussian fills, summed over all views."""
-        mass = self.splats.means.new_zeros(len(self.splats))
-        for view in self.visible.values():
-            mass[view.rows.long()] += view.pixels.float()
-        return mass
+        return total_pixels(self.visible, self.splats.means)
+
+    @cached_property
+    def floating(self) -> Float[Tensor, " n"]:
+        """How surely each Gaussian is a floater, 0…1."""
+        return floating(self.splats, self.visible, self.draw)
 
     @cached_property
     def trained_side(self) -> int:
@@ -446,12 +431,7 @@ class Scene:
     def gap(self) -> float:
         """Distance in world units below which matches are connected: 3 % of the median distance at which the
         scene is seen, about eight pixels of a small view; 0 if no training photo shows anything."""
-        distances = []
-        for view in self.visible.values():
-            pose, means = view.camera.view_matrix.to(self.splats.means), self.splats.means[view.rows]
-            if len(means):
-                distances.append(float((means @ pose[2, :3] + pose[2, 3]).median()))
-        return 0.03 * float(torch.tensor(distances).nanmedian()) if distances else 0.0
+        return 0.03 * median_distance(self.visible, self.splats.means)
 
     # ── features ────────────────────────────────────────────────────────────────────────────────────
 
@@ -486,24 +466,7 @@ class Scene:
         if the pixel lies outside the view.
         """
         words = shipped_vocabulary() if words is None else texts_of(words, "a word")
-        camera = self.camera(place, size)
-        if not (0 <= x < camera.width and 0 <= y < camera.height):
-            raise UserError(f"{x}, {y} lies outside the view of {camera.width} × {camera.height} pixels")
-        pixel = torch.zeros(camera.height, camera.width, device=self.device)
-        pixel[int(y), int(x)] = 1.0
-        share = self._fill(camera, pixel)
-        rows = share.nonzero().squeeze(1)
-        features = self.engine.features(rows)
-        if not words or float(share[rows] @ (features != 0).any(1).float()) < self.config.min_alpha:
-            return []
-        queries, negatives = self.text.plain_queries(words).to(self.device), self.text.config.negatives
-        cosines = queries.cosines(share[rows] @ features)
-        scores = queries.relevancy_of_cosines(cosines, self.engine.temperature).tolist()
-        named = sorted(zip(words, scores, strict=True), key=lambda pair: pair[1], reverse=True)
-        clear = any(score > CLEAR for word, score in named if word != "sky")
-        if not clear and negatives[int(cosines[: len(negatives)].argmax())] in NOTHING:
-            return []
-        return named[: max(most, 0)]
+        return answer.words_at(self, self.camera(place, size), x, y, words, most)
 
     # ── words taught by example ─────────────────────────────────────────────────────────────────────
 
@@ -522,19 +485,8 @@ class Scene:
             UserError: the marks show nothing or everything, or lie outside their photos; or a prompt of this
                 word would mean something else.
         """
-        prompt = taught_prompt(word)
         listed = [examples] if isinstance(examples, Example) else list(examples)
-        photos = [self.file.photo(example.photo) for example in listed]
-        listed = [replace(e, photo=p.name, size=p.file_size) for e, p in zip(listed, photos, strict=True)]
-        pairs = zip(listed, photos, strict=True)
-        weights = [Weights.of(example, photo, self.splats, self.backend) for example, photo in pairs]
-        if selection is not None:
-            selection = torch.as_tensor(selection, device=self.device)
-            weights = [Weights(w.seen * selection, torch.zeros_like(w.seen), w.seen) for w in weights]
-        queries = self.text.plain_queries([prompt.text]).to(self.device)
-        learned = learn(prompt.text, listed, weights, self.engine, queries)
-        learned = replace(learned, clip=self.file.clip_identity, scene=Path(self.file.data).name)
-        return self.with_words([*self.words.values(), learned])
+        return self.with_words([*self.words.values(), learned_word(self, word, listed, selection)])
 
     def with_words(self, words: Iterable[TaughtWord]) -> Scene:
         """Return this scene with other taught words (the last of equal names), sharing its results."""
@@ -546,29 +498,12 @@ class Scene:
         """Return a scene with a word taught elsewhere. If it was taught in these photos, of which a few may
         be gone, it is learned anew; if not, or if its marks no longer show anything, it is kept as it was
         learned there. Raises UserError if it was learned with another CLIP."""
-        sizes = {photo.name: photo.file_size for photo in self.photos}
-        marked = [e for e in word.examples if e.photo in sizes and e.size in (None, sizes[e.photo])]
-        # Two folders may have one name, with some photos of the same names.
-        if word.scene == Path(self.file.data).name and len(marked) > len(word.examples) / 2:
-            with suppress(UserError):
-                return self.teach(word.name, marked)
-        if len(word.vector) != self._semantics()[0].clip_dim or word.clip != self.file.clip_identity:
-            raise UserError(f"{word.name!r} was learned with another CLIP than this scene's: teach it anew")
-        return self.with_words([*self.words.values(), replace(word, examples=(), precision={})])
+        return self.with_words([*self.words.values(), carried_word(self, word)])
 
     def unsure(self, word: str) -> str:
         """Find the training photo in which a taught word is least certain, the best one to mark next. Raises
         UserError if the word was not taught."""
-        taught = self.words.get(known_word(word))
-        if taught is None:
-            raise UserError(f"{word!r} was not taught: see lang3dxl words")
-        self._check_views()
-        chance = self._one(taught.name).relevancy[0]
-        marked = {self.file.photo(example.photo).name for example in taught.examples}
-        views = {name: view for name, view in self.visible.items() if name not in marked} or self.visible
-        open_question = chance * (1 - chance)
-        unsure = {name: view.pixels @ open_question[view.rows.long()] for name, view in views.items()}
-        return max(unsure, key=lambda name: float(unsure[name]))
+        return least_certain_photo(self, word)
 
     # ── prompts ─────────────────────────────────────────────────────────────────────────────────────
 
@@ -579,6 +514,8 @@ class Scene:
         for text in listed:
             if isinstance(text, Tensor | Array):
                 text = Prompt("vector", vector=self._vector(text))
+            if isinstance(text, str) and known_word(text) in self.words:
+                text = Prompt(" ".join(text.split()))
             for prompt in [text] if isinstance(text, Prompt) else parse_prompts(text):
                 word = None if prompt.vector is not None else self.words.get(known_word(prompt.text))
                 prompts.append(prompt if word is None else replace(prompt, taught=word))
@@ -603,7 +540,7 @@ class Scene:
 
     def _vector(self, values: Any) -> Float[Tensor, " c"]:
         vector = values if isinstance(values, Tensor) else torch.from_numpy(np.asarray(values, np.float32))
-        width = self._semantics()[0].clip_dim
+        width = self.semantics()[0].clip_dim
         if vector.shape != (width,) or not bool(vector.isfinite().all()) or not bool(vector.any()):
             raise UserError(
                 f"a vector to search for has shape {list(vector.shape)}: this scene's CLIP has {width} "
@@ -617,15 +554,10 @@ class Scene:
             raise UserError(f"{text!r} are {len(question.prompts)} prompts: ask for one at a time")
         return question
 
-    def _ranked(self, question: Question, row: int) -> list[Viewpoint]:
-        """Return all training views, those that show a prompt first, best first."""
-        scores, threshold = question.relevancy[row], question.thresholds[row]
-        ranks = rank_views(self.visible, self.splats.means, scores, threshold)
-        return [replace(view, camera=self.file.photo(view.name).camera) for view in ranks]
-
     # ── computed once ───────────────────────────────────────────────────────────────────────────────
 
-    def _semantics(self) -> tuple[Decoder, Float[Tensor, "n d"]]:
+    def semantics(self) -> tuple[Decoder, Float[Tensor, "n d"]]:
+        """The decoder and the codes. Raises UserError for a scene with colors only."""
         if self.decoder is None or self.codes is None:
             raise UserError(NO_SEMANTICS)
         return self.decoder, self.codes
@@ -633,19 +565,32 @@ class Scene:
     @cached_property
     def engine(self) -> QueryEngine:
         """The query engine, which decodes the features of all Gaussians at first use."""
-        engine = make_engine(*self._semantics(), self.config.temperature)
+        engine = make_engine(*self.semantics(), self.config.temperature)
         return engine.calibrated(self.text.yardstick.to(self.device))
 
     @cached_property
     def text(self) -> TextEncoder:
         """The encoder of prompts, which loads the scene's CLIP at the first text that it doesn't know."""
-        self._semantics()
+        self.semantics()
         return TextEncoder(self._encode, self.config.text, self.vectors)
 
     def _encode(self, texts: list[str]) -> Float[Tensor, "n c"]:
         if self.encode_texts is None:
             self.encode_texts = text_encoder(self.file, self.device)
         return self.encode_texts(texts)
+
+    @cached_property
+    def foreignness(self) -> float | None:
+        """How far the scene is from what its CLIP was trained on, about 1 for scenes like that; see
+        `trust.foreignness`."""
+        return foreignness(self.engine, self.file.clip_identity)
+
+    @cached_property
+    def anchors(self) -> Bool[Tensor, "anchors n"]:
+        """Which Gaussians match each of the common words `trust.ANCHORS`."""
+        relevancy = self.engine.of_gaussians(self.text.plain_queries(ANCHORS).to(self.device))
+        levels = match_thresholds(relevancy, self.doubts.of(relevancy), [False] * len(ANCHORS))
+        return matching(relevancy, levels)
 
     @cached_property
     def doubts(self) -> Doubts:
@@ -658,7 +603,7 @@ def text_encoder(file: SceneRecord, device: torch.device | str) -> EncodeTexts:
     if file.clip is None:
         raise UserError(NO_SEMANTICS)
     encoder = load_image_text_encoder(file.clip, device)
-    if encoder.identity != file.clip_identity:
+    if not same_clip(encoder.identity, file.clip_identity):
         raise UserError(
             f"the CLIP in {file.clip} is not the one that this scene was made with: restore it, or train anew"
         )
@@ -672,6 +617,9 @@ def _pose(place: Any) -> Float[Tensor, "rows 4"]:
         raise TypeError(f"a place is a photo's name, a camera or a pose, not {place!r:.40}") from error
 
 
-def _several(texts: Any, found: Sequence[Any]) -> bool:
-    """Return whether the answer is a list: for a list of texts, and for a text that holds several prompts."""
-    return isinstance(texts, list | tuple) or len(found) > 1
+Answer = TypeVar("Answer", Match, Found)
+
+
+def _one_or_all(texts: object, found: list[Answer]) -> Answer | list[Answer]:
+    """Return all answers to a list of texts, or to a text that holds several prompts; else the only one."""
+    return found if isinstance(texts, list | tuple) or len(found) > 1 else found[0]

@@ -14,9 +14,9 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
-from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.query.doubt import UNRELATED
+from lang3dxl_ns.query.language import meaning, phrases_of
 from lang3dxl_ns.query.negatives import NEGATIVES, competitors
 from lang3dxl_ns.query.relevancy import Queries
 from lang3dxl_ns.query.vocabulary import searched, synonyms_of
@@ -28,7 +28,6 @@ EncodeTexts = Callable[[list[str]], Float[Tensor, "n c"]]
 _SAME = 0.95
 """Cosine from which a vector and a phrase are taken to mean the same."""
 _QUOTED = r'"[^"]*"'
-_NEGATIVES = re.compile(rf"\s*\bnot\s+({_QUOTED}(?:\s*,\s*{_QUOTED})*)", re.IGNORECASE)
 _SINGLE_QUOTES = re.compile(r"‘([^‘’]*)’")
 _CURLY_QUOTES = str.maketrans("“”„«»", '"""""')
 
@@ -61,36 +60,24 @@ def texts_of(texts: Any, what: str) -> list[str]:
 
 def taught_prompt(word: str) -> Prompt:
     """Return the prompt of a word that is to be taught. Raises UserError if no prompt means this word."""
-    prompt, *more = parse_prompts(word)
+    prompt, *more = parse_prompts(word if '"' in word else f'"{word}"')
     if more or known_word(prompt.text) != known_word(word):
         raise UserError(f"no prompt means {word!r}: name the word without quotes and semicolons")
     return prompt
 
 
 def parse_prompts(typed: str) -> list[Prompt]:
-    """Parse prompts separated by `;`, with optional negatives: `"windows" not "decorative opening"; dome`.
-    `not` is special only before a quoted phrase (several: `not "a", "b"`), so that phrases may contain the
-    word. A `;` in quotes doesn't separate. Raises UserError if there is no prompt."""
+    """Parse prompts as people type them: `windows and doors`, `windows, doors; dome`, `windows not doors`.
+    Quotes protect a phrase. The grammar is in `query/language.py`. Raises UserError if there is no prompt."""
     (clean,) = texts_of([typed], "a prompt")
-    clean = _SINGLE_QUOTES.sub(r'"\1"', clean.translate(_CURLY_QUOTES))
-    parts = re.findall(rf"(?:{_QUOTED}|[^;])+", clean)
-    prompts = [_parse_prompt(part) for part in parts if part.strip(' "\t\r\n\0')]
-    if not prompts:
+    clean = _SINGLE_QUOTES.sub(r'"\1"', clean.translate(_CURLY_QUOTES)).replace("\0", " ")
+    # Single spaces, since runs of them would take patterns a time that grows with their square.
+    found = phrases_of(" ".join(clean.split()))
+    if not found:
         raise UserError("the prompt is empty: type what to look for, such as rose window")
-    return prompts
-
-
-def _parse_prompt(part: str) -> Prompt:
-    negatives = [tidy(phrase) for found in _NEGATIVES.findall(part) for phrase in found.split('"')[1::2]]
-    text = tidy(_NEGATIVES.sub(" ", part))
-    if found := re.fullmatch(r"(.+) not(?: (.+))?", text, re.IGNORECASE):
-        say(
-            f"{text} is searched for as it stands. To tell one thing from another: "
-            f'"{found[1]}" not "{found[2] or "…"}"'
-        )
-    if not text:
-        raise UserError(f"{part.strip()!r} has only negatives: put what to find first")
-    return Prompt(text, tuple(negative for negative in negatives if negative))
+    if alone := [negatives for text, negatives in found if not text]:
+        raise UserError(f"{alone[0][0]!r} has only negatives: put what to find first")
+    return [Prompt(text, tuple(negatives)) for text, negatives in found]
 
 
 def tidy(text: str) -> str:
@@ -106,8 +93,6 @@ def listed_phrases(texts: Iterable[str]) -> list[str]:
 
 # ── what CLIP can't tell ────────────────────────────────────────────────────────────────────────────────
 
-_COLORS = "red|orange|yellow|green|blue|purple|pink|brown|black|white|gray|grey|golden"
-_COLOR = re.compile(rf"\b(?:{_COLORS})\b(?=\s+\S)", re.IGNORECASE)
 _MOST_WORDS = 50
 """Number of words that fit CLIP's 77 tokens."""
 _NO_NAME = re.compile(r"an?|the|and|or|of|in|on|at|to|it|is|are|this|that|these|those|what|where|\d+")
@@ -115,16 +100,12 @@ _NO_NAME = re.compile(r"an?|the|and|or|of|in|on|at|to|it|is|are|this|that|these|
 
 def caution(text: str) -> str | None:
     """Return a warning about a prompt that names nothing, such as *the* or *42*, or that has words which CLIP
-    can't tell (places, sizes, colors); None for others."""
+    can't tell (places, sizes, colors, an unquoted *not*); None for others."""
     if all(_NO_NAME.fullmatch(word) for word in re.findall(r"\w+", text.casefold())):
         return f"{text} names nothing that can be seen: what follows is chance"
-    if (found := searched(text)) != text:
-        return f"places and sizes are not told apart: {found} is searched for everywhere"
     if len(text.split()) > _MOST_WORDS:
         return f"CLIP reads about {_MOST_WORDS} words: the rest of this prompt is ignored"
-    if color := _COLOR.search(text):
-        return f"colors are hardly told apart: {color[0]} is likely to be ignored"
-    return None
+    return "; ".join(meaning(text).advice) or None
 
 
 # ── settings ────────────────────────────────────────────────────────────────────────────────────────────

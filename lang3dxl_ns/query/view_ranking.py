@@ -14,7 +14,7 @@ from lang3dxl_ns.common.device import to_device
 from lang3dxl_ns.query.visibility import VisibleGaussians
 from lang3dxl_ns.scene.camera import Camera
 
-_OUTLIERS = 0.02
+OUTLIERS = 0.02
 """Share of a match's points that its box excludes at either end of each axis."""
 STRONG = 0.5
 """Fraction of the way from the threshold to the highest relevancy from which Gaussians are the match."""
@@ -28,7 +28,7 @@ LARGE = 0.2
 """Share of a view above which larger matches score no higher."""
 RIM = 0.25
 """Weight of a match at a view's rim, where it is likely cut off; it is 1 in the middle half."""
-_DENSE = 0.002
+DENSE = 0.002
 """Share of a match's weight that a neighborhood must hold to belong to a group."""
 _MOST_POINTS = 20_000
 """Most Gaussians that are grouped, the heaviest ones."""
@@ -95,7 +95,7 @@ def strongest_match(
         return None
     # The highest relevancy apart from stray Gaussians: 2 % of the matching mass exceed it.
     order = rows[scores[rows].argsort(descending=True)]
-    beyond = (mass[order].cumsum(0) < _OUTLIERS * mass[order].sum()).sum()
+    beyond = (mass[order].cumsum(0) < OUTLIERS * mass[order].sum()).sum()
     best = scores[order[beyond.clamp_max(len(order) - 1)]]
 
     def things(closeness: float) -> list[Box]:
@@ -124,14 +124,14 @@ def groups(means: Float[Tensor, "n 3"], weight: Float[Tensor, " n"], gap: float)
     cell = cell.reshape(-1)
     sums = np.bincount(cell, share)
     centers = np.stack([np.bincount(cell, share * axis) / sums for axis in points.T], axis=1)
-    whole = DBSCAN(eps=gap, min_samples=1).fit_predict(centers, sample_weight=sums / (sums.sum() * _DENSE))
+    whole = DBSCAN(eps=gap, min_samples=1).fit_predict(centers, sample_weight=sums / (sums.sum() * DENSE))
     found = whole[cell]
     if (found < 0).all():  # no place is dense: take the heaviest Gaussian
         found = np.where(np.arange(len(found)) == share.argmax(), 0, -1)
     totals = np.bincount(found[found >= 0], weights=share[found >= 0]) / share.sum()
     boxes = []
     for i, total in enumerate(totals.tolist()):
-        ends = np.quantile(points[found == i], (_OUTLIERS, 1 - _OUTLIERS), axis=0, method="nearest")
+        ends = np.quantile(points[found == i], (OUTLIERS, 1 - OUTLIERS), axis=0, method="nearest")
         low, high = map(tuple, ends.tolist())
         boxes.append(Box(low, high, total))
     return boxes

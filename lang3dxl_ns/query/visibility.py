@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -13,10 +14,13 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from lang3dxl_ns.common.console import say
-from lang3dxl_ns.common.files import check_regular, write_atomically
+from lang3dxl_ns.common.console import say, tracked
+from lang3dxl_ns.common.files import check_regular, replace_file
 from lang3dxl_ns.preparation.store import hash_tensors
-from lang3dxl_ns.scene.camera import Camera
+from lang3dxl_ns.rendering import Backend, Splats, composite
+from lang3dxl_ns.rendering.gathering import filled_pixels
+from lang3dxl_ns.scene.camera import Camera, resized
+from lang3dxl_ns.scene.record import SceneRecord
 
 _LEAST = 1e-3
 """Pixels below which a Gaussian counts as not visible in a view."""
@@ -56,6 +60,59 @@ class VisibleGaussians:
         return self.camera.width * self.camera.height
 
 
+def measured(
+    record: SceneRecord,
+    splats: Splats,
+    most: int,
+    side: int,
+    *,
+    cache: Path | None = None,
+    backend: Backend = "auto",
+    watch: Callable[[str], None] | None = None,
+) -> Mapping[str, VisibleGaussians]:
+    """Measure which Gaussians at most `most` training views show, `side` pixels long, unless the `cache` has
+    it. watch: called with a short description of the work."""
+    chosen = spread([photo for photo in record.photos if photo.split == "train"], most)
+    cameras = {photo.name: resized(photo.camera, side) for photo in chosen}
+    key = ""
+    if cache is not None:
+        masks = [photo.mask_stamp() for photo in chosen]
+        key = fingerprint(vars(splats.gaussians), [asdict(record), most, side, splats.antialiased, masks])
+        if (kept := load_visible(cache, key, cameras, splats.means.device)) is not None:
+            return kept
+    views, what = dict[str, VisibleGaussians](), "measuring which Gaussians the photos show, once"
+    for name, camera in tracked(cameras.items(), what):
+        if watch is not None:
+            watch(f"{what}: view {len(views) + 1} of {len(cameras)}")
+        size = camera.height, camera.width
+        mask = record.photo(name).foreground(size)
+        weight = torch.ones(size) if mask is None else mask.float()
+        drawn = partial(composite, splats, camera, backend=backend)
+        filled = filled_pixels(drawn, weight.to(splats.means.device), len(splats))
+        views[name] = VisibleGaussians.of(camera, filled)
+    if cache is not None and views:
+        save_visible(cache, views, key)
+    return views
+
+
+def total_pixels(views: Mapping[str, VisibleGaussians], means: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
+    """Sum the pixels that every Gaussian fills over all views."""
+    mass = means.new_zeros(len(means))
+    for view in views.values():
+        mass[view.rows.long()] += view.pixels.float()
+    return mass
+
+
+def median_distance(views: Mapping[str, VisibleGaussians], means: Float[Tensor, "n 3"]) -> float:
+    """Compute the median over views of the median depth of what they show, in world units; 0 without any."""
+    distances = []
+    for view in views.values():
+        pose, shown = view.camera.view_matrix.to(means), means[view.rows]
+        if len(shown):
+            distances.append(float((shown @ pose[2, :3] + pose[2, 3]).median()))
+    return float(torch.tensor(distances).nanmedian()) if distances else 0.0
+
+
 def fingerprint(state: Mapping[str, Tensor], settings: object) -> str:
     """Hash tensors and settings (as JSON) to 16 hex digits."""
     digest = hashlib.sha256(json.dumps(settings, sort_keys=True, default=str).encode())
@@ -72,7 +129,7 @@ def save_visible(path: Path, views: Mapping[str, VisibleGaussians], key: str) ->
         "counts": torch.tensor([len(view.rows) for view in views.values()]),
     }
     try:
-        write_atomically(path, save(tensors, {"key": key, "checksum": fingerprint(tensors, key)}))
+        replace_file(path, save(tensors, {"key": key, "checksum": fingerprint(tensors, key)}))
     except OSError as error:
         say(f"{path} can't be cached ({error.strerror}): it will be made again the next time")
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
+from difflib import get_close_matches
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -11,9 +13,16 @@ from lang3dxl_ns.common.files import read_json
 from lang3dxl_ns.common.presets import load_preset
 from lang3dxl_ns.preparation.encoders import CLIP_OPTION, find_model
 from lang3dxl_ns.query.doubt import UNRELATED
-from lang3dxl_ns.query.negatives import NEGATIVES, singulars
+from lang3dxl_ns.query.language import meaning
+from lang3dxl_ns.query.negatives import NEGATIVES, alternatives, singulars
 from lang3dxl_ns.query.relevancy import CANONICAL
 from lang3dxl_ns.words.taught_words import known_word
+
+
+def same_thing(word: str, texts: Sequence[str]) -> bool:
+    """Return whether one of the texts is this word, singular or plural, or a synonym of it."""
+    forms = {form for text in texts for form in singulars(searched(text).lower())}
+    return word in forms or bool(forms & alternatives(word)) or word in synonyms_of(texts[0])
 
 
 @cache
@@ -33,22 +42,13 @@ _COMMON = (
     "fence", "sign", "lamp", "bench", "flag", "water", "mountain", "flower",
 )  # fmt: skip
 """Things around buildings that the table of architectural terms doesn't list."""
-_PLACES = "left|right|front|back|rear|top|bottom|upper|lower|middle|central|nearest|farthest|first|last"
-_SIZES = "main|big|large|huge|small|tiny|biggest|largest|smallest"
-_WHERE = re.compile(
-    rf"\s+(?:on|at|in|to|of|from|above|below|under|beside|behind|near)\s+(?:the\s+)?(?:{_PLACES})\b.*$"
-    rf"|^(?:(?:the|a)\s+)?(?:{_PLACES}|{_SIZES})\s+(?!of\b)(?=\S)",
-    re.IGNORECASE,
-)
-_NAME = re.compile(r"(The )?[A-Z]\w* [A-Z]\w*")
 _WHOLE = re.compile(r"(?P<end>[a-z]{3,})</w>|[▁Ġ](?P<start>[a-z]{3,})")
 """Pattern of tokens that are whole words: CLIP's tables mark their end, others mark their start."""
 
 
 def searched(text: str) -> str:
-    """Remove words that select by place or size: *windows on the left tower* becomes *windows*. A name such
-    as *Big Ben* stays."""
-    return text if _NAME.match(text) else _WHERE.sub("", text).strip() or text
+    """Return what a prompt searches for: *windows on the left tower* searches for *windows*."""
+    return meaning(text).target
 
 
 @cache
@@ -68,6 +68,14 @@ def common_words() -> tuple[str, ...]:
     plurals = [_plural(word) for word in alone]
     needed = [*NEGATIVES, *CANONICAL, *UNRELATED]
     return tuple(dict.fromkeys([*needed, *words, *map(searched, words), *plurals]))
+
+
+def closest_word(text: str, words: Sequence[str]) -> str | None:
+    """Return the word that a misspelled text most likely means; None for a text that is among the words."""
+    target = searched(text).lower()
+    if target in words or any(form in words for form in singulars(target)):
+        return None
+    return next(iter(get_close_matches(target, words, 1, 0.75)), None)
 
 
 def _plural(word: str) -> str:

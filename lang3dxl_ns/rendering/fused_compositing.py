@@ -13,6 +13,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from lang3dxl_ns.common.jit import in_threads, kernel, ranges
+from lang3dxl_ns.common.kernels import MOST_SUMS
 from lang3dxl_ns.rendering.fused_tiles import (
     CHANNELS_FROM,
     PIXELS,
@@ -82,11 +83,10 @@ class FusedCompositing(torch.autograd.Function):
             for slope, size in zip(upstream, ctx.sizes, strict=True)
         )
         maps = Maps(*(slope.numpy() for slope in slopes))
-        threads = torch.get_num_threads()
-        parts = _parts(ctx.trace.ends)
+        parts, columns = _parts(ctx.trace.ends), CHANNELS_FROM + plan.table.shape[1]
+        threads = _summing_threads(len(plan.order) * columns * plan.splats.itemsize)
         # Every thread has fixed tiles and its own sums, so the result does not depend on their order.
         dealt = [np.concatenate(parts[k::threads]) for k in range(min(threads, len(parts)))]
-        columns = CHANNELS_FROM + plan.table.shape[1]
         sums = _kept.take((len(dealt), len(plan.order), columns), plan.splats.dtype)
         in_threads(backward_tiles, [(tiles, plan, maps, ctx.trace, sums[k]) for k, tiles in enumerate(dealt)])
         found = [torch.zeros_like(part) for part in (positions, conics, opacities)]
@@ -105,6 +105,11 @@ class _Gradients(NamedTuple):
     opacity: Float[np.ndarray, " n"]
     channels: Float[np.ndarray, "n c"]
     variances: Float[np.ndarray, "n 2"]
+
+
+def _summing_threads(each: int) -> int:
+    """Return how many threads may keep sums of `each` bytes."""
+    return max(min(torch.get_num_threads(), MOST_SUMS // max(each, 1)), 1)
 
 
 def _parts(work: np.ndarray) -> list[np.ndarray]:

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from jaxtyping import Bool, Float, Float64
 from numpy import ndarray as Array
 from torch import Tensor
@@ -166,6 +167,12 @@ class Camera:
         """Return the camera without gradient."""
         return replace(self, view_matrix=self.view_matrix.detach(), intrinsics=self.intrinsics.detach())
 
+    def same_as(self, other: Camera) -> bool:
+        """Return whether another camera has the same pose, lens and size, so that views of both coincide."""
+        parts = ((self.view_matrix, other.view_matrix), (self.intrinsics, other.intrinsics))
+        size = (self.width, self.height) == (other.width, other.height)
+        return size and all(torch.equal(one.cpu(), another.cpu()) for one, another in parts)
+
     def to(self, device: torch.device | str) -> Camera:
         """Return the camera on a device."""
         view, intrinsics = (to_device(part, device) for part in (self.view_matrix, self.intrinsics))
@@ -270,3 +277,23 @@ def posed(pose: Float[Tensor, "rows 4"], like: Camera) -> Camera:
     except ValueError as error:
         raise UserError(f"{error}: give camera → world, such as the `pose` of a photo") from error
     return replace(like, view_matrix=view_matrix(pose[:3].float()))
+
+
+def level(up: Float[Tensor, "3"], turn: float = 0.0) -> Float[Tensor, "3"]:
+    """Return the direction perpendicular to `up` at a fraction of a full turn."""
+    first = F.one_hot(up.abs().argmin(), 3).to(up)
+    side = F.normalize(torch.linalg.cross(up, first), dim=0)
+    return math.cos(2 * math.pi * turn) * side + math.sin(2 * math.pi * turn) * torch.linalg.cross(up, side)
+
+
+def looking(
+    place: Float[Tensor, "3"], target: Float[Tensor, "3"], up: Float[Tensor, "3"]
+) -> Float[Tensor, "4 4"]:
+    """Build an upright camera's view matrix (world → camera, OpenCV axes) from its place and its target."""
+    forward = F.normalize(target - place, dim=0)
+    right = F.normalize(torch.linalg.cross(forward, up), dim=0)
+    down = torch.linalg.cross(forward, right)
+    view = torch.eye(4)
+    view[:3, :3] = torch.stack([right, down, forward])
+    view[:3, 3] = -view[:3, :3] @ place
+    return view

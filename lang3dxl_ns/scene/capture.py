@@ -6,6 +6,7 @@ A capture comes from a COLMAP model, a transforms.json, a folder of photos alone
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -355,12 +356,14 @@ def _mention_what_is_not_used(capture: Capture, model: Path, listed: set[str]) -
     beside = sorted(model.parent.glob("[0-9]*")) if model.name.isdigit() else []
     others = [f for f in beside if f != model and f.name.isdigit() and any(f.glob("images.*"))]
     if others:
-        counts = (f"{f.name} with {photos_in_model(f)}" for f in others)
+
+        def counted(found: Path) -> str:
+            return f"{os.path.relpath(found, capture.folder)} with {photos_in_model(found)}"
+
         say(
-            f"{model.parent} has {len(others) + 1} models; used is {model.name} with "
-            f"{photos_in_model(model)} "
-            f"photos. There are also {', '.join(counts)}: choose with `lang3dxl-colmap --colmap-path FOLDER` "
-            "after all other options"
+            f"{capture.folder} has {len(others) + 1} models; used is {counted(model)} photos. There are also "
+            f"{', '.join(map(counted, others))}: choose with `lang3dxl-colmap --colmap-path FOLDER` after "
+            "all other options"
         )
     unknown = [name for name in photos_below(capture.images) if name not in listed]
     if unknown:

@@ -7,6 +7,7 @@ missing.
 
 from __future__ import annotations
 
+import re
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -187,7 +188,7 @@ def _lines(content: bytes) -> Iterator[tuple[int, str]]:
     a byte order mark, and some write two bytes per character."""
     wide = content.startswith((b"\xff\xfe", b"\xfe\xff"))
     text = content.decode("utf-16", "replace") if wide else content.decode("utf-8-sig", "surrogateescape")
-    for number, line in enumerate(text.split("\n"), 1):
+    for number, line in enumerate(re.split(r"\r\n?|\n", text), 1):
         if (line := line.strip(" \t\r\0")) and not line.startswith("#"):
             yield number, line
 
@@ -199,7 +200,8 @@ def _bad(path: Path, number: int, line: str, what: str) -> UserError:
 def _text_cameras(path: Path, content: bytes) -> Iterator[tuple[int, ModelCamera]]:
     for number, line in _lines(content):
         words = line.split()
-        if len(words) > 1 and words[1] not in _SIZES:
+        model = words[1].upper() if len(words) > 1 else ""
+        if len(words) > 1 and model not in _SIZES:
             raise UserError(
                 f"camera {words[0]} in {path} has the camera model {words[1]:.40}, which is unknown: run "
                 "colmap "
@@ -210,7 +212,7 @@ def _text_cameras(path: Path, content: bytes) -> Iterator[tuple[int, ModelCamera
             if not (width.is_integer() and height.is_integer()):
                 raise ValueError(f"its size is {width} × {height}")
             size = int(width), int(height)
-            yield int(words[0]), _camera(words[1], size, tuple(map(float, words[4:])))
+            yield int(words[0]), _camera(model, size, tuple(map(float, words[4:])))
         except (ValueError, IndexError, OverflowError) as error:
             raise _bad(path, number, line, f"is not a camera ({error})") from error
 
@@ -280,5 +282,5 @@ def _text_points(
     shades = np.full(whole.shape, _GRAY, np.uint8)
     given = whole[known].clip(0, 65535)
     shades[known] = color_bytes(given if (given % 1).any() else given.astype(np.int64))
-    ids = np.array(numbers, np.float64) if any(abs(n) >= 2**63 for n in numbers) else np.array(numbers)
-    return ids.astype(np.int64), np.array(positions, np.float64).reshape(-1, 3), shades, colorless
+    ids = np.array([n if abs(n) < 1 << 63 else -1 for n in numbers], np.int64)  # as for no point
+    return ids, np.array(positions, np.float64).reshape(-1, 3), shades, colorless

@@ -6,6 +6,7 @@ comes from the cameras, and GPS gives what is left: scale and heading.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import combinations
@@ -58,7 +59,7 @@ def georeference_from_json(content: dict[str, Any]) -> Georeference:
         expect(is_coordinate(number) and number > 0, f"its meters are {number!r}")
     for axis in (found.up, found.north):
         known = len(axis) == 3 and all(is_coordinate(value) for value in axis)
-        expect(known and abs(np.linalg.norm(axis) - 1) < 1e-3, f"a direction is {axis!r}")
+        expect(known and abs(math.hypot(*axis) - 1) < 1e-3, f"a direction is {axis!r}")
     expect(isinstance(found.photos, int), f"it has GPS of {found.photos!r} photos")
     return found
 

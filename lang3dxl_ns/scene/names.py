@@ -93,6 +93,8 @@ def resolve(
     guessed = dict[str, str]()
     for name in others:
         fitting = finder.find(name)
+        if fitting == [name]:
+            continue  # it is something else than a file
         if len(fitting) == 1:
             guessed[name] = fitting[0]
         elif fitting:

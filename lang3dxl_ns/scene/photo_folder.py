@@ -21,7 +21,7 @@ from scipy import ndimage
 
 from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import DAMAGE, UserError
-from lang3dxl_ns.common.files import expanded, read_json, write_atomically
+from lang3dxl_ns.common.files import expanded, read_json, replace_file
 from lang3dxl_ns.common.pictures import (
     OTHER_SUFFIXES,
     PHOTO_SUFFIXES,
@@ -107,10 +107,12 @@ def photos_below(folder: Path) -> list[str]:
 
 
 def files_below(folder: Path) -> Iterator[str]:
-    """Yield all files in a folder and its sub-folders, without hidden ones and the cache."""
+    """Yield all regular files in a folder and its sub-folders, without hidden ones and the cache."""
     for parent, folders, files in os.walk(folder):
         folders[:] = [f for f in folders if f != "lang3dxl_cache" and not f.startswith(".")]
-        yield from (Path(parent, file).relative_to(folder).as_posix() for file in files if file[0] != ".")
+        for path in (Path(parent, file) for file in files if not file.startswith(".")):
+            if path.is_file():
+                yield path.relative_to(folder).as_posix()
 
 
 def _size_and_lens(path: Path) -> tuple[tuple[int, int], tuple | None]:
@@ -188,7 +190,7 @@ def extract_frames(video: Path, rate: float = FRAMES_PER_SECOND, most: int = MOS
     if len(sharpness) < 3:
         raise UserError(f"{video} has {len(sharpness)} frames: a scene needs a walk of some seconds")
     _write(video, folder, _sharpest(sharpness, min(stretches, len(sharpness))))
-    write_atomically(made_of, json.dumps(this))
+    replace_file(made_of, json.dumps(this))
     return folder
 
 

@@ -23,7 +23,7 @@ import numpy as np
 from lang3dxl_ns.common.checks import check_numbers
 from lang3dxl_ns.common.console import progress, say
 from lang3dxl_ns.common.errors import DAMAGE, UserError, is_plain
-from lang3dxl_ns.common.files import expanded, locked, read_json, write_atomically
+from lang3dxl_ns.common.files import expanded, locked, read_json, replace_file
 from lang3dxl_ns.common.memory import machine_memory
 from lang3dxl_ns.common.pictures import open_picture
 from lang3dxl_ns.common.reports import measure, part
@@ -97,7 +97,7 @@ def reconstruct(
         seconds={stage: round(sum(spent), 1) for stage, spent in clock.items()},
     )  # fmt: skip
     _publish(models, model)
-    write_atomically(work / "report.json", json.dumps(asdict(report), indent=2))
+    replace_file(work / "report.json", json.dumps(asdict(report), indent=2))
     return report
 
 
@@ -218,7 +218,7 @@ def _database(photos: PhotoFolder, copies: PhotoFolder, work: Path, settings: Re
         numbers = [number[name] for name in group]
         pycolmap.import_images(importing, copies.folder, pycolmap.CameraMode.SINGLE, numbers)
     importing.rename(database)
-    write_atomically(stamped, stamp)
+    replace_file(stamped, stamp)
     return database
 
 

@@ -24,7 +24,7 @@ from torch import Tensor
 
 from lang3dxl_ns.common.checks import expect, is_coordinate
 from lang3dxl_ns.common.errors import UserError, readable
-from lang3dxl_ns.common.files import read_json, write_atomically
+from lang3dxl_ns.common.files import read_json, replace_file
 from lang3dxl_ns.common.image import resize_nearest
 from lang3dxl_ns.scene.camera import Camera, Lens, check_pose, view_matrix
 from lang3dxl_ns.scene.companions import is_name
@@ -132,7 +132,7 @@ class SceneRecord:
     clip: str | None
     """Folder or name of the CLIP that made the targets; None for a run with colors only."""
     clip_identity: str | None
-    """Fingerprint of the CLIP's weights."""
+    """Fingerprint of the CLIP's weights and, after a dot, of its tokenizer (`same_clip`)."""
     scale: float
     """Factor in: model's frame = scale · transform · COLMAP's frame."""
     transform: list[list[float]]
@@ -151,7 +151,7 @@ class SceneRecord:
 
     def write(self, path: Path) -> None:
         """Write the file, atomically."""
-        write_atomically(path, json.dumps({"version": _VERSION, **asdict(self)}) + "\n")
+        replace_file(path, json.dumps({"version": _VERSION, **asdict(self)}) + "\n")
 
     @classmethod
     def read(cls, path: Path) -> SceneRecord:
@@ -180,6 +180,14 @@ class SceneRecord:
         names = [photo.name for photo in self.photos]
         similar = get_close_matches(name, names, n=3) or names[:3]
         raise UserError(f"the scene has no photo {name!r}: it has {len(names)}, such as {', '.join(similar)}")
+
+
+def same_clip(one: str | None, other: str | None) -> bool:
+    """Return whether two fingerprints are of one CLIP. Earlier ones lack the part of the tokenizer, after a
+    dot, and fit any."""
+    if one is None or other is None or "." not in one or "." not in other:
+        return (one or "").partition(".")[0] == (other or "").partition(".")[0]
+    return one == other
 
 
 def scene_from_json(content: dict[str, Any]) -> SceneRecord:

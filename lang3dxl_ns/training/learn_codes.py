@@ -4,22 +4,31 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import partial
 
 import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn import Parameter
 
 from lang3dxl_ns.common.console import progress, say, tracked
 from lang3dxl_ns.common.device import in_full_precision
 from lang3dxl_ns.components.feature_decoder import Decoder, Gathered
 from lang3dxl_ns.components.principal_basis import PrincipalBasis
+from lang3dxl_ns.preparation.targets import Batch, foreground
+from lang3dxl_ns.rendering import composite
 from lang3dxl_ns.rendering.gathering import Composite, Pixels, gather
+from lang3dxl_ns.scene.camera import resized
 from lang3dxl_ns.training.sharpening import sharpen
+from lang3dxl_ns.training.state import PhotoCamera, Training
 
 ClipMaps = Callable[[], Iterable[Float[Tensor, "hd wd c"]]]
 DenseMaps = Callable[[], Iterable[Float[Tensor, "t t d"]]]
 DENSE_AXES = 32
 """Number of principal components of the dense features by which groups are formed."""
+LONGER_SIDE = 1_600
+"""Longer side in pixels to which larger photos are reduced for gathering: a CLIP crop covers hundreds of
+pixels, and time and memory grow with their number."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,6 +45,38 @@ class TargetView:
     """Dense features of the photo squashed to a square."""
     mask: Bool[Tensor, "h w"] | None = None
     """Foreground; None if it is the whole photo."""
+
+
+def learn_words(run: Training, photos: Iterable[tuple[PhotoCamera, Batch]], count: int) -> None:
+    """Give a run's Gaussians codes that represent the targets of this number of photos; see `learn_codes`."""
+    semantics, facts = run.parts.semantics, run.facts
+    assert semantics is not None and facts.clip_targets is not None
+    views, means = (_target_view(run, *photo) for photo in photos), run.gaussians["means"].detach()
+    # Initial codes are fitted to the unsharpened targets, which the loss compares with.
+    dense = None if run.learns_from_renderings else facts.dense_targets
+    codes = learn_codes(semantics.decoder, views, count, means, facts.clip_targets, dense)
+    if run.learns_from_renderings:
+        run.gaussians["codes"].data.copy_(codes.nan_to_num(0.0))
+    else:
+        run.gaussians["codes"] = Parameter(codes.to(run.device), requires_grad=False)
+
+
+def forget_words(run: Training) -> None:
+    """Remove codes that were gathered for a question in training, since the Gaussians still change."""
+    if run.learns_words_at_the_end and "codes" in run.gaussians:
+        del run.gaussians["codes"]
+
+
+def _target_view(run: Training, view: PhotoCamera, batch: Batch) -> TargetView:
+    camera = resized(view.camera(run.pose(view)).detach(), LONGER_SIDE)
+    splats, size = run.splats(), (camera.height, camera.width)
+    return TargetView(
+        partial(composite, splats, camera, backend=run.backend),
+        size,
+        batch["clip_target"],
+        batch.get("dense_target"),
+        foreground(batch),
+    )
 
 
 # A training step's autocast would keep 16-bit copies of the first weights through all steps of the fit.

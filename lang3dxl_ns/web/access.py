@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import ipaddress
 import secrets
+import socket
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from http import HTTPStatus
 from typing import Any
@@ -47,6 +48,11 @@ class Access:
         host = f"[{host}]" if ":" in host else host
         return f"http://{host}:{self.port}/" + (f"?{_TOKEN}={self.token}" if self.needs_token else "")
 
+    @property
+    def elsewhere(self) -> str | None:
+        """URL to open on other machines, if this server takes requests at all addresses of this one."""
+        return replace(self, host=_own_address()).address if self.host in EVERYWHERE else None
+
     def refusal(self, path: str, headers: Any) -> Response | None:
         """Return the response to a refused request; None for one that may proceed. headers: as read by
         `http.server` or websockets, whose `get_all` returns all values of a name."""
@@ -54,6 +60,10 @@ class Access:
             host, origin = _only(headers, "Host") or "", _only(headers, "Origin")
             # With a token any name passes.
             ours = self.needs_token or urlsplit(f"//{host}").hostname in (*LOCAL_NAMES, self.host)
+            # Other sites' pages may link here, but not make this server work with pictures or scripts.
+            site, mode = (headers.get(f"Sec-Fetch-{name}") for name in ("Site", "Mode"))
+            if site == "cross-site" and mode != "navigate" and not self.needs_token:
+                return _refused("This page answers its own requests alone.")
             if not ours or (origin is not None and not _same_site(origin, host)):
                 return _refused(f"This page is not served to {origin or host}.")
             if not self.needs_token or self._knows_token(headers):
@@ -78,6 +88,14 @@ class Access:
 def _same_site(origin: str, host: str) -> bool:
     site = urlsplit(origin)
     return site.scheme in ("http", "https") and site.netloc.lower() == host.lower()
+
+
+def _own_address() -> str:
+    """Return the address by which the network reaches this machine, or its name if it has no network."""
+    with suppress(OSError), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.connect(("192.0.2.1", 9))  # chooses a route, and sends nothing
+        return str(probe.getsockname()[0])
+    return socket.gethostname()
 
 
 def _only(headers: Any, name: str) -> str | None:

@@ -34,14 +34,15 @@ export class Answers {
   }
 
   /** Return peak, doubt, threshold, and the number of Gaussians of the foreground that match.
-   * strict: whether the prompt has negatives of its own, or was taught; doubt: of a word that was taught. */
-  verdict(relevancy, { strict = false, doubt = null, threshold = null }) {
+   * strict: whether the prompt has negatives of its own, or was taught; doubt: of a word that was taught;
+   * name: the prompt, for comparing it with common words. */
+  verdict(relevancy, { strict = false, doubt = null, threshold = null, name = null }) {
     const { unrelated, rules } = this.words, sorted = relevancy.slice().sort(), count = sorted.length;
     let fit = 0;
     const top = Math.max(Math.ceil(rules.best * count), 1);
     for (let i = count - top; i < count; i++) fit += sorted[i] / top;
     const asWell = unrelated.filter((other) => other >= fit * TIE).length;
-    const mostDoubt = doubt === null ? rules.doubtful : rules.doubtful_taught;
+    const taught = doubt !== null, mostDoubt = doubt === null ? rules.doubtful : rules.doubtful_taught;
     doubt ??= fit < rules.least_peak ? 1 : (1 + asWell) / (1 + unrelated.length);
     const low = sorted[(count - 1) >> 1]; // the lower median, as in torch
     const isDoubtful = doubt > mostDoubt;
@@ -50,7 +51,43 @@ export class Answers {
     const confined = foreground ? relevancy.map((value, i) => value * foreground[i]) : relevancy;
     let matching = 0, peak = 0;
     for (const value of confined) (peak = Math.max(peak, value)), (matching += value > level);
-    return { relevancy: confined, peak, doubt, doubtful: isDoubtful, threshold: level, matching };
+    const alike = taught || name === null ? [] : this.alike(name, relevancy, own);
+    const trust = this.trust({ doubt, isDoubtful, fit, taught, alike });
+    return { relevancy: confined, peak, doubt, doubtful: isDoubtful, threshold: level, own, matching, trust };
+  }
+
+  /** Judge an answer by one word and its reason, as Python's query/trust.py does. */
+  trust({ doubt, isDoubtful, fit, taught, alike }) {
+    const { rules, foreign } = this.words, far = foreign !== null && foreign >= rules.far;
+    const best = `the best places fit at ${fit.toFixed(2)}`, told = (level, reason) => ({ level, reason, far, alike });
+    const world = far ? `; this scene is ${foreign.toFixed(1)} times as far from what its CLIP was trained on as usual` : "";
+    if (isDoubtful && taught) return told("doubtful", `${Math.round(100 * doubt)} % of what was not marked fits as well`);
+    if (doubt === 1) return told("doubtful", "it fits no place: it may not be here, or this scene's CLIP may not know the word");
+    if (isDoubtful) return told("doubtful", `${Math.round(100 * doubt)} % of unrelated words fit this scene as well`);
+    if (taught) return told("sure", "taught by example");
+    if (fit < rules.faint) return told("doubtful", `${best}, and other words fit better there: it may not be here`);
+    const least = far ? Math.min(rules.clearly + rules.stricter * (foreign - 1), rules.strictest) : rules.clearly;
+    if (fit < least) return told("uncertain", `${best}, where right words reach 1.00${world}`);
+    if (alike.length) return told("uncertain", `it selects the same as ${alike.join(" and ")}`);
+    return told("sure", best + world);
+  }
+
+  /** List the common words that select the same Gaussians, but for those that mean the same. */
+  alike(name, relevancy, level) {
+    this.common ??= Object.keys(this.vocabulary.anchors).map((word) => {
+      const values = this.relevancy(this.vocabulary.word(this.vocabulary.index.get(word)));
+      return { word, values, level: this.verdict(values, {}).own };
+    });
+    const same = ({ values, level: other }) => {
+      let both = 0, either = 0;
+      for (let i = 0; i < values.length; i++) {
+        const here = relevancy[i] > level, there = values[i] > other;
+        both += here && there;
+        either += here || there;
+      }
+      return both > 0 && both >= this.words.rules.alike * either;
+    };
+    return this.common.filter((one) => same(one) && !this.vocabulary.isSame(one.word, name)).map(({ word }) => word);
   }
 
   /** Find the words that match a blend of rows best, with their relevancy, best first; none at the sky. */

@@ -1,4 +1,5 @@
-// Pieces of the panel: messages, and a card per prompt with its color, heat, threshold and doubt.
+// Pieces of the panel: messages, and a card per prompt with its color, heat, threshold and trust.
+import { advice } from "./vocabulary.js";
 
 export const percent = (share) => (share > 0 && share < 0.01 ? "under 1 %" : `${Math.round(100 * share)} %`);
 export const shown = (text, most = 60) => (text.length > most ? `${text.slice(0, most - 1)}…` : text);
@@ -20,14 +21,14 @@ export const explain = ({ count, known, live, foreground }) =>
 
 export const matched = (count) => `${count.toLocaleString("en")} Gaussians match.`;
 
-function doubtIn({ examples, open, taught, doubt, doubtful }) {
+function doubtIn({ text, examples, open, taught, trust }) {
   const count = examples && `${examples.length} example${examples.length > 1 ? "s" : ""}`;
   if (examples) return open ? `${count}: click for more, with Alt or “Not this” for what it is not.` : `${count}.`;
-  if (taught) return doubtful ? `Doubtful: ${percent(doubt)} of what was not marked fits as well.` : "Taught by example.";
-  if (doubt === 1) return "Doubtful: it fits no place. It may not be here, or this scene's CLIP may not know the word.";
-  if (doubtful) return `Doubtful: ${percent(doubt)} of unrelated words fit this scene as well. It may not be here, or this scene's CLIP may not know the word.`;
-  return `Fits better than ${percent(1 - doubt)} of unrelated words.`;
+  const remedy = trust.far ? "Outline it, or train with a larger CLIP (lang3dxl view or teach; docs: encoders)." : "Outline it, or click one and take Like this.";
+  return [...advice(text).map(sentence), `${sentence(trust.level)} ${sentence(trust.reason)}`, ...(trust.level === "sure" || taught ? [] : [remedy])].join(" ");
 }
+
+const sentence = (text) => `${text[0].toUpperCase()}${text.slice(1)}.`;
 
 /** Build a prompt's card. acts: { fly, remove, rename, dragThreshold, setThreshold, teach, outline, save, forget },
  * each called with the prompt. */

@@ -1,7 +1,9 @@
 // Location of a match: the views that show it best, and a box around its strongest part, as in Python's query/.
 
-const PEAK = 1e-3, LARGE = 0.2, RIM = 0.25, STRONG = 0.5, CORE = 0.9, JOINED = 2;
-const OUTLIERS = 0.02, DENSE = 0.002, BINS = 1000;
+import language from "./language.js";
+
+const { PEAK, LARGE, RIM, STRONG, CORE, JOINED, OUTLIERS, DENSE } = language.ranking; // of query/view_ranking.py
+const BINS = 1000;
 
 /** Read views with the Gaussians that they show, and the share of the view that each fills: sizes[codes[k]]. */
 export function readViews(about, buffer) {
@@ -16,7 +18,7 @@ export function readViews(about, buffer) {
   });
 }
 
-/** Rank views by how well they show a match; see places.py. */
+/** Rank views by how well they show a match; see query/view_ranking.py. */
 export function rankViews(views, centers, relevancy, threshold) {
   const peaks = views.map((view) => peakOf(view, relevancy)), top = Math.max(...peaks);
   const low = top > threshold ? threshold : relevancy.slice().sort()[(relevancy.length - 1) >> 1];

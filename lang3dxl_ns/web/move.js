@@ -1,7 +1,7 @@
 // The eye: orbiting and walking by mouse, touch and keys, flights, and the space where it may be.
 import { OrbitControls, PerspectiveCamera, Vector3 } from "./splats.js";
 
-const FLIGHT = 1200, WIDEST = 85, MARGIN = 1.06; // milliseconds, degrees, room around the overview
+const FLIGHT = 1200, WIDEST = 85; // milliseconds, degrees
 const TURN = 0.1, TAP = 0.1, PACE = 0.25; // radians and seconds of a key press; share of the overview's depth walked in a second
 const LOOK = 0.003, WHEEL = 0.001, STEEPEST = 1.5; // radians per pixel, seconds per unit of the wheel, radians
 const WAYS = { w: [0, 0, 1], s: [0, 0, -1], a: [-1, 0, 0], d: [1, 0, 0], q: [0, -1, 0], e: [0, 1, 0] }; // right, up, ahead
@@ -86,7 +86,7 @@ export class Mover extends EventTarget {
     const rows = this.about.start.pose.slice(0, 3), axis = (k) => new Vector3(...rows.map((row) => row[k]));
     const turn = ([low, high]) => Math.tan((Math.atan(low) + Math.atan(high)) / 2), half = ([low, high]) => Math.tan((Math.atan(high) - Math.atan(low)) / 2);
     const ahead = axis(2).negate().addScaledVector(axis(0), turn([left, right])).addScaledVector(axis(1), -turn([top, bottom])).normalize();
-    const needed = MARGIN * Math.max(half([top, bottom]), half([left, right]) / this.aspect), most = Math.tan((WIDEST * Math.PI) / 360);
+    const needed = Math.max(half([top, bottom]), half([left, right]) / this.aspect), most = Math.tan((WIDEST * Math.PI) / 360);
     const position = start.position.clone();
     for (let away = depth * (needed / most - 1), step = 20; away > 0 && step > 0; step--) {
       const back = start.position.clone().addScaledVector(ahead, (-away * step) / 20);

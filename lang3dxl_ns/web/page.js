@@ -2,7 +2,7 @@
 import { element, explain, matched, percent, promptCard, say, shown } from "./cards.js";
 import { Kept, readFields, Steps, written } from "./history.js";
 import { Photos } from "./photos.js";
-import { areExamples, asPython, drawOutline, examplesAsText, examplesFromText, inside, UNNAMED, wordsFile } from "./teach.js";
+import { areExamples, asPython, drawOutline, examplesAsText, examplesFromText, inside, rounded, UNNAMED, wordsFile } from "./teach.js";
 import { thinker } from "./think.js";
 import { parsePrompts, tidy } from "./vocabulary.js";
 import { View } from "./view.js";
@@ -266,7 +266,7 @@ async function addMark(prompt, pixels, without, outline = null) {
   const { rows, photo, points } = await think("mark", { camera: view.picking, pixels, prefer });
   if (!rows.length) return say("Nothing with a meaning is there: mark another place.");
   const index = about.cameras.findIndex(({ name }) => name === (inPhoto ? photos.shown.name : photo));
-  const place = index < 0 ? {} : inPhoto ? { photo: index, [outline ? "outline" : "points"]: there } : { photo: index, points };
+  const place = index < 0 ? {} : inPhoto ? { photo: index, [outline ? "outline" : "points"]: rounded(there) } : { photo: index, points: rounded(points) };
   prompt.examples.push({ rows, without: Boolean(without && prompt.examples.length), ...place });
   prompt.inScene = false;
   await answer(prompt);
@@ -438,7 +438,7 @@ function listen() {
   });
   on("boxed", "change", () => (drawBoxes(), keepAddress()));
   on("clear", "click", clear);
-  on("overview", "click", () => (photos.hide(), view.mover.overview()));
+  on("overview", "click", () => (photos.hide(), quiet(), view.mover.overview()));
   on("teach", "click", () => startWord().card.querySelector("input").focus());
   on("still", "click", saveStill);
   on("link", "click", copyLink);
@@ -533,13 +533,13 @@ function hideFloaters() {
   if (!view.floats) return;
   const limit = 255 - Math.round(2.55 * Number($("hide").value));
   view.hide(view.floats, limit);
-  think("hide", { floats: view.floats, limit });
+  if (about.words) think("hide", { floats: view.floats, limit });
 }
 
 // ── start ──
 
 async function fetched(name) {
-  const file = await fetch(name);
+  const file = await fetch(about?.files?.[name] ?? name); // a written page's data have names by content
   if (!file.ok) throw new Error(`${name} is missing (${file.status}): write the page again.`);
   return file;
 }
@@ -572,9 +572,13 @@ async function readMeaning(splats) {
   Object.assign(about, { known, seconds });
   say(explain(about));
   attempt(suggest);
-  if (!about.floaters) return;
+}
+
+/** Read which Gaussians float, once the page answers. */
+async function readFloaters() {
   view.floats = new Uint8Array(await (await fetched(about.floaters)).arrayBuffer());
   $("floating").hidden = false;
+  hideFloaters();
 }
 
 /** Keep the eye in the free space from now on. */
@@ -589,6 +593,8 @@ async function begin() {
   const turn = cleared;
   view.mover.first = location.hash.length > 1 ? null : view.mover.address;
   if (about.words) setTimeout(() => think("space").then(limit)); // behind the prompts
+  setTimeout(() => attempt(readFloaters));
+  if (about.hide) $("hide").value = 50;
   if (location.hash.length > 1) return apply(location.hash, turn);
   for (const [text, ...negatives] of about.prompts) if (turn === cleared) await ask(asTyped({ text, negatives }), turn);
   if (turn === cleared) settle("");
@@ -600,6 +606,7 @@ window.lang3dxl = {
   ask: (typed) => ask(typed),
   clear,
   whatIs,
+  prompts,
   get view() {
     return view;
   },

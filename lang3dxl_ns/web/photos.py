@@ -23,8 +23,11 @@ PHOTO_SIDE, _QUALITY = 720, 80
 """Longer side in pixels of a page's photos, and quality of their JPEGs."""
 MOST_CAMERAS = 400
 """Most photos whose cameras a page knows; evenly spaced ones are kept."""
-_CUT = 0.01
-"""Share of what a scene's views show that may lie beyond each side of the overview."""
+_ROOM = 1.06
+"""Room around what the overview shows besides its photo."""
+_CUT, _WIDER, _BEHIND = 0.003, 1.6, 1.5
+"""Share of what a scene's views show that may lie beyond each side of the overview; how much farther than its
+photo an overview reaches; and how much farther than the middle of the scene what it shows may lie."""
 
 
 def photos_shown(scene: Scene) -> list[ScenePhoto]:
@@ -68,25 +71,26 @@ def extent(scene: Scene) -> list[float]:
     """Measure what an overview shows, from the camera of `scene.overview`.
 
     Returns the slopes (x / z and y / z, OpenCV's axes) left, top, right and bottom, beyond each of which lies
-    at most a hundredth of what the photos show, and the median depth in world units. All of the overview photo
-    belongs to it."""
+    hardly anything of what the photos show of the landmark, and the depth of its middle in world
+    units. All of the overview photo belongs to it."""
     camera = scene.overview.full_camera
     (fx, _, cx), (_, fy, cy), _ = camera.intrinsics.tolist()
-    ends = [-cx / fx, -cy / fy, (camera.width - cx) / fx, (camera.height - cy) / fy]
+    own = [-cx / fx, -cy / fy, (camera.width - cx) / fx, (camera.height - cy) / fy]
     places, mass = _seen_from(camera, scene.splats), scene.mass
-    ahead = places[:, 2] > 0.01
-    if not bool((mass[ahead] > 0).any()):
-        return [*ends, 1.0]
-    places, mass = places[ahead], mass[ahead]
+    middle = float(places[:, 2][scene.splats.sound()].median()) if len(places) else 0.0
+    # The sky and distant surroundings lie far behind, and what stands before the landmark hides less of it.
+    kept = (places[:, 2] > 0.5 * middle) & (places[:, 2] < _BEHIND * middle) & (mass > 0)
+    if middle <= 0 or not bool(kept.any()):
+        return [*own, 1.0]
+    places, mass = places[kept], mass[kept]
+    ends = list(own)
     for axis in (0, 1):
         slopes, order = (places[:, axis] / places[:, 2]).sort()
         share = mass[order].cumsum(0) / mass.sum()
         low, high = (int((share < level).sum().clamp_max(len(share) - 1)) for level in (_CUT, 1 - _CUT))
-        ends[axis] = min(ends[axis], float(slopes[low]))
-        ends[axis + 2] = max(ends[axis + 2], float(slopes[high]))
-    depths, order = places[:, 2].sort()
-    half = int((mass[order].cumsum(0) < mass.sum() / 2).sum().clamp_max(len(depths) - 1))
-    return [*ends, float(depths[half])]
+        ends[axis] = min(own[axis], max(_ROOM * float(slopes[low]), _WIDER * own[axis]))
+        ends[axis + 2] = max(own[axis + 2], min(_ROOM * float(slopes[high]), _WIDER * own[axis + 2]))
+    return [*ends, middle]
 
 
 def _seen_from(camera: Camera, splats: Splats) -> torch.Tensor:

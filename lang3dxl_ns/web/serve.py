@@ -74,6 +74,8 @@ class PageServer(ThreadingHTTPServer):
             return HTTPStatus.OK, _KINDS["json"], json.dumps(answer).encode()
         if place.path == "/api/look":
             return HTTPStatus.OK, _BYTES, self.page.colors(values.get("photo", ""))
+        if place.path == "/api/floaters":
+            return HTTPStatus.OK, _BYTES, self.page.floaters()
         if place.path == "/api/photo":
             return HTTPStatus.OK, "image/jpeg", self.page.photo(values.get("name", ""))
         name = place.path.removeprefix("/") or "index.html"
@@ -97,6 +99,8 @@ class Handler(BaseHTTPRequestHandler):
 
     def do_GET(self) -> None:
         """Answer the request, unless access is refused."""
+        if self.headers.get("Transfer-Encoding") or self.headers.get("Content-Length", "0") != "0":
+            self.close_connection = True  # the body, which nothing reads, is not another request
         self._answer(lambda: self.server.answer(self.path))
 
     def do_POST(self) -> None:

@@ -29,14 +29,16 @@ function contains(outline, [x, y]) {
   return within;
 }
 
-// ── marks in a link: rows, then the photo's number with places in thousandths of its sides ──
+// ── marks in a link: rows, then the photo's number with places in it, in shares of its sides ──
 
-const thousandths = (points) => points.map(([u, v]) => `${Math.round(1000 * u)}.${Math.round(1000 * v)}`).join("!");
+const FINE = 1e5; // steps of a side in which places are kept
+export const rounded = (points) => points?.map((place) => place.map((share) => Math.round(FINE * share) / FINE));
+const placesAsText = (points) => points.map((place) => place.map((share) => Math.round(FINE * share)).join(".")).join("!");
 
 /** Write examples as text, for the address. */
 export function examplesAsText(name, examples) {
   const one = ({ rows, without, photo, points, outline }) =>
-    (without ? "-" : "") + rows.join(".") + (photo === undefined ? "" : `@${photo}${outline ? "o" : "p"}${thousandths(outline ?? points)}`);
+    (without ? "-" : "") + rows.join(".") + (photo === undefined ? "" : `@${photo}${outline ? "o" : "p"}${placesAsText(outline ?? points)}`);
   const all = [name, ...examples.map(one)].join("~");
   // Photos' places are for files of words: a link that would be too long keeps what the page itself needs.
   return all.length <= LONGEST ? all : [name, ...examples.map(({ rows, without }) => one({ rows, without }))].join("~");
@@ -47,7 +49,7 @@ export function examplesFromText(text, about) {
   const [name, ...parts] = text.split("~");
   const examples = parts.map((part) => {
     const [rows, place] = part.replace("-", "").split("@"), [, photo, kind, points] = /^(\d+)([op])([\d.!]+)$/.exec(place ?? "") ?? [];
-    const read = points?.split("!").map((pair) => pair.split(".").map((value) => Number(value) / 1000));
+    const read = points?.split("!").map((pair) => pair.split(".").map((value) => Number(value) / FINE));
     const marked = photo !== undefined && Number(photo) < (about.cameras?.length ?? 0) && { photo: Number(photo), [kind === "o" ? "outline" : "points"]: read };
     return { rows: rows.split(".").map(Number), without: part.startsWith("-"), ...marked };
   });
@@ -69,9 +71,9 @@ export function asPython(examples, cameras) {
   for (const example of examples.filter(({ photo }) => photo !== undefined)) {
     const camera = cameras[example.photo], file = (points) => points.map((point) => inFile(point, camera));
     if (!photos.has(camera)) photos.set(camera, { photo: camera.name, points: [], not_points: [], size: camera.file, outlines: [] });
-    const found = photos.get(camera);
+    const found = photos.get(camera), pixels = (points) => file(points).map((place) => place.map((value) => Math.max(value - 0.5, 0))); // Python counts from pixels' centers
     if (example.outline && !example.without) found.outlines.push(file(example.outline));
-    else found[example.without ? "not_points" : "points"].push(...file(example.outline ? inside(example.outline) : example.points));
+    else found[example.without ? "not_points" : "points"].push(...pixels(example.outline ? inside(example.outline) : example.points));
   }
   return [...photos.values()]
     .map(({ outlines, ...rest }) => ({ ...rest, ...(outlines.length && { mask: maskOf(outlines, rest.size) }) }))

@@ -169,7 +169,7 @@ export class View extends EventTarget {
   /** Project a point of the world to a pixel; null behind the camera. */
   pixel(point) {
     const seen = new Vector3(...point).project(this.camera);
-    if (seen.z > 1) return null;
+    if (!(seen.z <= 1) || !Number.isFinite(seen.x + seen.y)) return null;
     return [((seen.x + 1) / 2) * this.frame.clientWidth, ((1 - seen.y) / 2) * this.frame.clientHeight];
   }
 

@@ -1,20 +1,72 @@
 // Words that this scene knows, in its own numbers, and phrases that a live server encodes.
 import { floats } from "./decode.js";
+import language from "./language.js"; // written beside this file from query/language.json
 
 const MOST_TEXT = 2000; // most characters of a phrase
 
 export const tidy = (text) => text.replace(/["\0]/g, " ").split(/\s+/).filter(Boolean).join(" ");
 
-/** Parse prompts separated by `;`, each with optional negatives: `"windows" not "doors"; dome`. */
+// ── what people type, as in Python's query/language.py; both read query/language.json ──
+
+const HELD = "\ue000"; // stands for a separator that is part of a phrase
+const any = (kind) => [...language[kind]].sort((a, b) => b.length - a.length).join("|");
+const L = "[\\p{L}\\p{N}_]";
+const whole = (kind) => new RegExp(`(?<!${L})(?:${any(kind)})(?!${L})`, "giu");
+const leading = (kinds) => new RegExp(`^(?:${kinds.map(any).join("|")})\\s+(?=\\S)`, "iu");
+const WHERE = new RegExp(
+  `\\s+(?:${any("before_places")})\\s+(?:the\\s+)?(?:${any("places")})(?!${L}).*$` +
+  `|^(?:${any("places")}|${any("sizes")})\\s+(?!of(?!${L}))(?=\\S)|\\s+(?:${any("after")})$`, "giu"); // prettier-ignore
+
+/** Parse prompts, each with negatives: `windows and doors; dome not roof`. Quotes protect a phrase. */
 export function parsePrompts(typed) {
-  const parts = typed.replace(/‘([^‘’]*)’|[“”„«»]/g, (_, quoted) => (quoted === undefined ? '"' : `"${quoted}"`)).match(/(?:"[^"]*"|[^;])+/g) ?? [];
-  const negative = /\s*\bnot\s+("[^"]*"(?:\s*,\s*"[^"]*")*)/gi;
+  const held = [], hold = (text) => HELD + (held.push(text) - 1) + HELD;
+  const plain = typed.replace(/‘([^‘’]*)’|[“”„«»]/g, (_, quoted) => (quoted === undefined ? '"' : `"${quoted}"`)).replaceAll("\0", " ");
+  const restored = (text) => tidy(text.replace(new RegExp(`${HELD}(\\d+)${HELD}`, "g"), (_, i) => held[i]));
+  const listed = (text) => text.split(",").flatMap((piece) => piece.split(whole("and"))).filter((part) => part.trim());
+  const parts = plain.replace(/"[^"]*"/g, hold).replace(whole("one"), hold).split(";");
   return parts
-    .map((part) => ({
-      text: tidy(part.replace(negative, " ")),
-      negatives: [...part.matchAll(negative)].flatMap((m) => m[1].split('"').filter((_, i) => i % 2)).map(tidy).filter(Boolean),
-    }))
-    .filter((prompt) => prompt.text);
+    .flatMap((part) => {
+      const [wanted, ...others] = part.split(whole("not")), negatives = others.flatMap(listed).map(restored).filter(Boolean);
+      return listed(wanted).map((text) => ({ text: restored(text), negatives }));
+    })
+    .filter(({ text }) => text);
+}
+
+/** Find out what a prompt searches for, and which parts of it the answer does not use, as [kind, part]. */
+export function meaning(text) {
+  if (/^(The )?[A-Z][\p{L}\p{N}_]* [A-Z][\p{L}\p{N}_]*/u.test(text) && english(text) === text) return { target: text, unused: [] };
+  const unused = [], counted = leading(["count"]).exec(text);
+  let target = text.replace(/[\s?!.]+$/, "") || text;
+  const cut = (pattern) => (target = target.replace(pattern, ""));
+  if (leading(["lead", "count"]).test(target)) {
+    if (counted) unused.push(["count", counted[0].trim()]);
+    cut(leading(["lead", "count"]));
+    cut(/\s+(?:are|is)(?:\s+there)?$/);
+  }
+  const without = leading(["no"]).exec(target);
+  if (without) unused.push(["no", without[0].trim()]), cut(leading(["no"]));
+  cut(leading(["articles"]));
+  const places = target.match(WHERE);
+  if (places) {
+    unused.push(["place", places.map((part) => part.trim()).join(" ")]);
+    target = target.replace(WHERE, "").trim();
+    cut(leading(["articles"]));
+  }
+  target = english(target.trim() || text);
+  const color = new RegExp(`(?<!${L})(?:${any("colors")})(?=\\s+\\S)`, "iu").exec(target);
+  if (color) unused.push(["color", color[0]]);
+  return { target, unused };
+}
+
+function english(text) {
+  const words = tidy(text.toLowerCase()).split(" "), table = language.german;
+  return words.every((word) => Object.hasOwn(table, word)) ? words.map((word) => table[word]).join(" ") : text;
+}
+
+/** Describe the parts of a prompt that its answer does not use. */
+export function advice(text) {
+  const { target, unused } = meaning(text);
+  return unused.map(([kind, part]) => language.unused[kind].replace("{target}", target).replace("{part}", part));
 }
 
 export class Vocabulary {
@@ -34,19 +86,32 @@ export class Vocabulary {
   /** Look up a word: itself, what is searched for, its shared negatives, and what examples taught. */
   word(i) {
     const own = this.row(this.negatives.length + i), [near, against] = this.special[i] ?? [];
-    return { own, near: near?.map((row) => this.row(row)) ?? [own], against: against ?? this.all, taught: this.taught[i] };
+    return { name: this.words[i], own, near: near?.map((row) => this.row(row)) ?? [own], against: against ?? this.all, taught: this.taught[i] };
   }
 
   /** Look up any phrase in the same way; null if this page doesn't know it. */
   async phrase(text) {
-    const plain = [...tidy(text)].slice(0, MOST_TEXT).join(""), known = this.index.get(plain.toLowerCase());
+    const plain = [...tidy(text)].slice(0, MOST_TEXT).join(""), known = this.place(plain);
     if (!this.live) return known === undefined ? null : this.word(known);
     if (!this.encoded.has(plain)) {
       const answer = await fetch(`api/encode?text=${encodeURIComponent(plain)}`);
       if (!answer.ok) throw new Error(await answer.text());
-      this.encoded.set(plain, await answer.json());
+      this.encoded.set(plain, { name: plain, ...(await answer.json()) });
     }
     return this.encoded.get(plain);
+  }
+
+  /** Find a word's place: as typed, or else what it searches for, without its color, or in singular or plural. */
+  place(text) {
+    const { target, unused } = meaning(text), color = unused.find(([kind]) => kind === "color");
+    const plain = color ? tidy(target.replace(color[1], "")) : target;
+    const forms = [text, target, plain, `${plain}s`, plain.replace(/s$/, ""), plain.replace(/es$/, "")];
+    return forms.map((form) => this.index.get(form.toLowerCase())).find((place) => place !== undefined);
+  }
+
+  /** Return whether a prompt means the same as a common word. */
+  isSame(anchor, name) {
+    return this.anchors[anchor].includes((this.words[this.place(name)] ?? name).toLowerCase());
   }
 
   /** Ask the live server anew about a phrase. */
@@ -56,7 +121,7 @@ export class Vocabulary {
 
   /** Find the words spelled most like a phrase, or contained in it. */
   closest(text, most = 5) {
-    const plain = tidy(text).toLowerCase(), pairs = pairsOf(plain), parts = plain.split(" ");
+    const plain = meaning(tidy(text)).target.toLowerCase(), pairs = pairsOf(plain), parts = plain.split(" ");
     const likeness = (word) => {
       if (parts.includes(word) || parts.includes(`${word}s`)) return 2;
       const others = pairsOf(word), common = [...others].filter((pair) => pairs.has(pair)).length;
@@ -69,7 +134,8 @@ export class Vocabulary {
   /** Find words to offer while the user types. */
   offered(typed, most = 12) {
     const start = tidy(typed).toLowerCase(), first = [], later = [];
-    for (const word of this.words) {
+    const taught = Object.keys(this.taught).map((i) => this.words[i]);
+    for (const word of new Set([...taught, ...this.words])) {
       const at = word.toLowerCase().indexOf(start);
       if (at === 0) first.push(word);
       else if (at > 0 && later.length < most) later.push(word);

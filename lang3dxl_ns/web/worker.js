@@ -20,7 +20,7 @@ async function understood(phrases) {
 /** Compute the verdict about a prompt whose phrases are known. */
 function judged([text, ...negatives], threshold) {
   const relevancy = answers.relevancy(text, negatives.map(({ own }) => own));
-  return answers.verdict(relevancy, { strict: Boolean(negatives.length || text.taught), doubt: text.taught?.doubt, threshold });
+  return answers.verdict(relevancy, { strict: Boolean(negatives.length || text.taught), doubt: text.taught?.doubt, threshold, name: text.name });
 }
 
 /** Compute which Gaussians may match: 1 where any of these prompts does; null without prompts. */
@@ -35,25 +35,27 @@ async function foregroundOf(prompts) {
 }
 
 async function file(name) {
-  const answer = await fetch(name);
+  const answer = await fetch(about.files?.[name] ?? name);
   if (!answer.ok) throw new Error(`${name} is missing (${answer.status})`);
-  return answer.arrayBuffer();
+  return answer;
 }
+
+const bytes = async (name) => (await file(name)).arrayBuffer();
 
 const jobs = {
   async load({ description, splats }) {
     about = description;
     const { words } = about, start = performance.now();
-    const [listed, numbers] = [await (await fetch("vocabulary.json")).json(), await file("vocabulary.bin")];
+    const [listed, numbers] = [await (await file("vocabulary.json")).json(), await bytes("vocabulary.bin")];
     vocabulary = new Vocabulary(listed, numbers, words.width, about.live);
     const tell = (done) => new Promise((go) => (postMessage({ done }), setTimeout(go)));
     const rows = words.field
-      ? await decodedRows(words, await file("codes.bin"), await file("field.bin"), tell)
-      : shippedRows(words, await file("rows.bin"));
+      ? await decodedRows(words, await bytes("codes.bin"), await bytes("field.bin"), tell)
+      : shippedRows(words, await bytes("rows.bin"));
     answers = new Answers(rows, vocabulary, words);
     geometry = unpackSplats(splats);
     opacities = geometry.opacities;
-    views = readViews(about, await file("views.bin")).map((view) => ({
+    views = readViews(about, await bytes("views.bin")).map((view) => ({
       ...view,
       pose: view.pose.map((row, axis) => (axis < 3 ? [...row.slice(0, 3), row[3] - about.center[axis]] : row)),
     }));

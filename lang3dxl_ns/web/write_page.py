@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,17 +18,20 @@ from torch import Tensor
 
 from lang3dxl_ns.common.console import tracked
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.common.files import make_folder, write_atomically
+from lang3dxl_ns.common.files import make_folder, replace_file
 from lang3dxl_ns.common.pictures import PHOTO_SUFFIXES
 from lang3dxl_ns.files.scene_file import Provenance
+from lang3dxl_ns.query import view_ranking
 from lang3dxl_ns.query.doubt import BEST, DOUBTFUL, DOUBTFUL_TAUGHT, LEAST_PEAK
 from lang3dxl_ns.query.heat_maps import PROMPT_COLORS
+from lang3dxl_ns.query.language import TABLE
 from lang3dxl_ns.query.negatives import CLEAR, NOTHING, competitors
 from lang3dxl_ns.query.scene import NO_SEMANTICS, Scene
 from lang3dxl_ns.query.text import Prompt, tidy
 from lang3dxl_ns.query.thresholds import EVEN, SHARE
+from lang3dxl_ns.query.trust import ALIKE, ANCHORS, CLEARLY, FAINT, FAR, STRICTER, STRICTEST
 from lang3dxl_ns.query.visibility import spread
-from lang3dxl_ns.query.vocabulary import common_words, shipped_vocabulary
+from lang3dxl_ns.query.vocabulary import common_words, same_thing, shipped_vocabulary
 from lang3dxl_ns.web.pack import (
     LEAST_PIXELS,
     PIXEL_STEPS,
@@ -50,11 +55,17 @@ _MOST_BYTES = 8_000_000
 """Most bytes of the views that the page flies to, and of the lightings; evenly spaced ones are kept."""
 _RULES = {
     **{"best": BEST, "doubtful": DOUBTFUL, "doubtful_taught": DOUBTFUL_TAUGHT, "least_peak": LEAST_PEAK},
-    **{"even": EVEN, "share": SHARE, "clear": CLEAR},
+    **{"even": EVEN, "share": SHARE, "clear": CLEAR, "alike": ALIKE, "faint": FAINT},
+    **{"clearly": CLEARLY, "stricter": STRICTER, "strictest": STRICTEST, "far": FAR},
 }
 """Numbers that decide what matches, what is doubtful and what a place is called, for the page's answers."""
+_RANKING = ("PEAK", "LARGE", "RIM", "STRONG", "CORE", "JOINED", "OUTLIERS", "DENSE")
 _TEXTS = 256
 """Number of texts encoded at a time."""
+_DATA = re.compile(
+    r"(splats|codes|field|rows|vocabulary|views|look\d+|photo\d+)\.[0-9a-f]{12}\.(bin|json|jpg)"
+)
+"""Names of a page's data files. Nothing else in its folder is ever deleted."""
 MOST_TEXT = 2_000
 """Most characters of a phrase, of which CLIP reads about 300."""
 
@@ -76,6 +87,8 @@ class Page:
     """Training photo whose lighting is shown; default: the overview photo."""
     photos: Path | None = None
     """Folder of the photos, of which the page shows small copies; if None, it shows their cameras alone."""
+    hide_floaters: bool = False
+    """Whether the page opens with floaters hidden."""
     live: bool = False
     """Whether a server encodes any other text (`answer`)."""
     own_words: PageWords = field(default_factory=PageWords)
@@ -103,6 +116,7 @@ class Page:
         means = scene.splats.means[scene.splats.sound()]
         center = means.median(0).values if len(means) else self._toward
         files = {path.name: path.read_bytes() for path in _FILES}
+        files["language.js"] = language_module()
         files["splats.bin"] = pack_splats(scene.baked(self.look), center, self._toward).tobytes()
         up = np.mean([photo.pose[:3, 1] for photo in scene.photos], axis=0)
         told = self.provenance
@@ -121,6 +135,9 @@ class Page:
             "words": None,
         }
         files |= self._photos(about)
+        about["floaters"], about["hide"] = "api/floaters" if self.live else "floaters.bin", self.hide_floaters
+        if not self.live:
+            files["floaters.bin"] = self.floaters()
         about["looks"] = {name: f"api/look?photo={quote(name)}" for name in self._looks}
         if not self.live:  # without a server the lightings are files, read when they are chosen
             chosen = self._within_limits("lightings", self._looks, [4 * len(scene.splats)] * len(self._looks))
@@ -134,6 +151,7 @@ class Page:
                 "gap": scene.gap,
                 "covered": scene.config.min_alpha,
                 "rules": _RULES,
+                "foreign": scene.foreignness,
                 "pixels": [LEAST_PIXELS, PIXEL_STEPS],
             }
             files |= self._meaning.files | self._vocabulary(self._meaning)
@@ -179,7 +197,7 @@ class Page:
         negatives, taught = list(self.scene.text.config.negatives), self.scene.words
         asked = [phrase for phrases in _phrases([*self.prompts, *self._foreground]) for phrase in phrases]
         naming = _distinct([*shipped_vocabulary(), *self.words, *asked])
-        others = [*(word.name for word in taught.values()), *common_words(), *self.more]
+        others = [*(word.name for word in taught.values()), *common_words(), *ANCHORS, *self.more]
         words = _distinct([*naming, *others])
         numbers = [*self._encoded(meaning, negatives), *self._encoded(meaning, words)]
         count = len(negatives) + len(words)
@@ -201,6 +219,9 @@ class Page:
         described = {"negatives": negatives, "words": words, "naming": len(naming), "special": special}
         described["nothing"] = [i for i, phrase in enumerate(negatives) if phrase in NOTHING]
         described["taught"] = learned
+        described["anchors"] = {
+            anchor: [known_word(word) for word in words if same_thing(anchor, [word])] for anchor in ANCHORS
+        }
         listed = json.dumps(described).encode()
         return {"vocabulary.json": listed, "vocabulary.bin": halves(torch.cat(numbers))}
 
@@ -247,9 +268,20 @@ class Page:
             raise UserError("the photos are not at hand: name their folder with --photos")
         return small_photo(self.scene.file.photo(name), self.photos)
 
+    def floaters(self) -> bytes:
+        """Compute how surely each Gaussian is a floater, a byte each."""
+        return (self.scene.floating * 255).round().byte().cpu().numpy().tobytes()
+
     def colors(self, photo: str) -> bytes:
         """Compute every Gaussian's color and opacity in a photo's look. Raises UserError if there is none."""
         return pack_colors(self.scene.baked(photo), self._toward).tobytes()
+
+
+def language_module() -> bytes:
+    """Write the table of what people type, and the numbers by which views are ranked, as a module."""
+    table = {name: value for name, value in TABLE.items() if name != "cases"}
+    table["ranking"] = {name: getattr(view_ranking, name) for name in _RANKING}
+    return f"export default {json.dumps(table, ensure_ascii=False)};\n".encode()
 
 
 def _phrases(prompts: Sequence[Prompt]) -> list[list[str]]:
@@ -266,26 +298,40 @@ def write_page(page: Page, folder: Path) -> int:
     """Write a page's files into a folder for any static web server; return the number of bytes. Raises
     UserError for a folder that has files of these names, or pictures, and is not such a page."""
     make_folder(folder)
-    index, names = folder / _INDEX.name, {*(path.name for path in _FILES), "scene.json", "vocabulary.json"}
+    index, names = (
+        folder / _INDEX.name,
+        {*(path.name for path in _FILES), "scene.json", "vocabulary.json", "language.js"},
+    )
     ours = index.is_file() and "<title>A scene to ask</title>" in index.read_text(errors="replace")
     other = (".bin", *PHOTO_SUFFIXES)  # whoever serves a folder of photos would publish them
     here = sorted(folder.iterdir())
     taken = [path.name for path in here if path.name in names or path.suffix.lower() in other]
     if taken and not ours:
         raise UserError(f"{folder} holds {taken[0]}, which is not a scene's page: name a folder of its own")
-    files, earlier = page.files(), _photos_of(folder)
-    for name, content in files.items():
-        write_atomically(folder / name, content)
+    files = page.files()
+    own, data = [path.name for path in _FILES], sorted(files.keys() - {path.name for path in _FILES})
+    data.remove("scene.json")
+    # Data have names by content, which scene.json lists: a page whose writing is stopped, or whose files a
+    # browser or a copy keeps from earlier, never shows the splats of one scene with the words of another.
+    named = {name: _by_content(name, files[name]) for name in data}
+    about = json.loads(files["scene.json"]) | {"files": named}
+    for camera in about["cameras"]:
+        camera["photo"] = named.get(camera["photo"], camera["photo"])
+    for name in own[:1] if not ours else []:  # marks the folder as ours
+        replace_file(folder / name, files[name])
+    for name, stored in named.items():
+        replace_file(folder / stored, files[name])
+    for name in own:
+        replace_file(folder / name, files[name])
+    files["scene.json"] = json.dumps(about).encode()
+    replace_file(folder / "scene.json", files["scene.json"])
     for path in here:  # of the page that this one replaces
-        if (path.suffix == ".bin" or path.name in earlier) and path.name not in files:
-            path.unlink()
+        if ours and _DATA.fullmatch(path.name) and path.name not in named.values():
+            path.unlink(missing_ok=True)
     return sum(map(len, files.values()))
 
 
-def _photos_of(folder: Path) -> set[str]:
-    """Return the names of the photos of the page in a folder, if it holds one."""
-    try:
-        cameras = json.loads((folder / "scene.json").read_bytes())["cameras"]
-        return {f"photo{i}.jpg" for i in range(len(cameras))} & {camera["photo"] for camera in cameras}
-    except (OSError, ValueError, LookupError, TypeError):
-        return set()  # no page, an older one, or a damaged one
+def _by_content(name: str, content: bytes) -> str:
+    """Return a file's name with a hash of its content: splats.0123456789ab.bin."""
+    stem, _, ending = name.rpartition(".")
+    return f"{stem}.{hashlib.sha256(content).hexdigest()[:12]}.{ending}"

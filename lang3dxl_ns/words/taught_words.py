@@ -19,7 +19,6 @@ from torch import Tensor
 from lang3dxl_ns.common.checks import expect
 from lang3dxl_ns.common.errors import UserError, readable
 from lang3dxl_ns.common.files import expanded, read_json, write_atomically
-from lang3dxl_ns.scene.camera import MOST_PIXELS
 
 Point = tuple[float, float]
 Box = tuple[float, float, float, float]
@@ -27,6 +26,10 @@ MASK_SIDE = 1024
 """Longer side in pixels of a mask that is kept."""
 _OUTLINE, _BOX = 100, 30
 """Number of clicks that an outline and a box are worth."""
+_MOST_WEIGHT = 100.0
+"""Largest weight of a word's text; those that are learned are at most 1.5."""
+_MOST_PIXELS = 1 << 30
+"""Most pixels of all masks in one file of words: a thousand of the largest."""
 _VERSION = 1
 
 
@@ -90,7 +93,7 @@ class Example:
         mask = box = None
         if "mask" in content:
             height, width = map(int, content["mask"]["size"])
-            expect(min(height, width) > 0 and height * width <= MOST_PIXELS, "a mask is too large")
+            expect(min(height, width) > 0 and max(height, width) <= MASK_SIDE, "a mask is too large")
             mask = mask_of(content["mask"]["counts"], (height, width))
         if "box" in content:
             left, top, right, bottom = map(float, content["box"])
@@ -119,9 +122,10 @@ def run_lengths(mask: Bool[Array, "h w"]) -> list[int]:
 
 def mask_of(lengths: Sequence[int], size: tuple[int, int]) -> Bool[Array, "h w"]:
     """Build the mask (height, width) with these `run_lengths`. Raises ValueError if the sizes differ."""
-    counts = np.asarray(lengths, np.int64)
-    if (counts < 0).any() or counts.sum() != size[0] * size[1]:
-        raise ValueError("run lengths don't fit the size of their mask")
+    whole = size[0] * size[1]
+    counts = [int(length) for length in lengths]  # Python's sum of them can't overflow
+    expect(len(counts) <= whole + 1 and min(counts, default=0) >= 0, "a mask has more runs than pixels")
+    expect(sum(counts) == whole, "run lengths don't fit the size of their mask")
     return np.repeat(np.arange(len(counts)) % 2 == 1, counts).reshape(size, order="F")
 
 
@@ -184,10 +188,12 @@ class TaughtWord:
         vector = torch.tensor([float(x) for x in content["vector"]])
         finite = all(map(math.isfinite, (bias, text, doubt))) and bool(vector.isfinite().all())
         expect(finite and len(vector) > 0, "a word has a value that is not a number")
+        expect(0 <= text <= _MOST_WEIGHT and 0 <= doubt <= 1, "a word has a value that no examples teach")
         name, scene, clip = content["name"], content["scene"], content["clip"]
         named = isinstance(name, str) and known_word(name) != ""
         expect(named and isinstance(scene, str) and isinstance(clip, str | None), "a word has no name")
         precision = {str(photo): float(value) for photo, value in content["precision"].items()}
+        expect(all(0 <= value <= 1 for value in precision.values()), "a word has a precision beyond 0…1")
         examples = tuple(map(Example.from_json, content["examples"]))
         return cls(name, vector, bias, text, doubt, precision, examples, clip, scene)
 
@@ -197,8 +203,19 @@ def known_word(text: str) -> str:
     return " ".join(text.lower().split())
 
 
+def words_from_json(content: Sequence[Any]) -> list[TaughtWord]:
+    """Build all words of a file; raises as `TaughtWord.from_json`, also for masks that are too many."""
+    masks = [example["mask"]["size"] for word in content for example in word["examples"] if "mask" in example]
+    expect(sum(math.prod(map(int, size)) for size in masks) <= _MOST_PIXELS, "its masks are too large")
+    return list(map(TaughtWord.from_json, content))
+
+
 def save_words(path: Path, words: Sequence[TaughtWord]) -> None:
-    """Write words as JSON, atomically. `load_words` reads the file."""
+    """Write words as JSON, atomically. `load_words` reads the file. Raises UserError for a file that holds
+    something else, or that a newer version wrote."""
+    if (path := expanded(path)).is_file() and path.stat().st_size:
+        with readable(f"{path} is another file than one of taught words", "choose another name"):
+            expect(read_json(path)["version"] == _VERSION and "words" in read_json(path), "it has no words")
     content = {"version": _VERSION, "words": [word.to_json() for word in words]}
     write_atomically(path, json.dumps(content, ensure_ascii=False) + "\n")
 
@@ -209,4 +226,4 @@ def load_words(path: Path) -> list[TaughtWord]:
         content = read_json(expanded(path))
         if content["version"] != _VERSION:
             raise UserError(f"{path} has format {content['version']}: update lang3dxl-ns to read it")
-        return list(map(TaughtWord.from_json, content["words"]))
+        return words_from_json(content["words"])

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import torch
 from box_splat import box_splat
-from lang3dxl_ns.preparation.photo_collection import read_collection
 from moved_splats import transformed, with_colors
 from scenes import write_scene
 
@@ -22,6 +21,7 @@ from lang3dxl_ns.files.read_splats import read_splats
 from lang3dxl_ns.files.scene_file import read_scene
 from lang3dxl_ns.files.scene_file import write_scene as write_scene_file
 from lang3dxl_ns.files.splat_file import write_splats
+from lang3dxl_ns.scene.capture import open_capture
 from lang3dxl_ns.words.taught_words import Example
 
 SETTINGS = AttachConfig(views=6, up="z", clip="builtin", dense="builtin", dense_tokens=16)
@@ -41,7 +41,7 @@ def place(tmp_path_factory):
     """A splat in nerfstudio's frame, its photos, and the scene attached to them."""
     folder = tmp_path_factory.mktemp("attach")
     write_scene(folder / "photos", size=(120, 90), photos=8, points=400)
-    photos = read_collection(folder / "photos")
+    photos = open_capture(folder / "photos")
     frame = known_frames(photos.reconstruction, folder / "box.ply")["nerfstudio's, with z up"]
     write_splats(folder / "box.ply", transformed(box_splat(0.1), torch.from_numpy(frame)))
     attach(folder / "box.ply", folder / "photos", folder / "box.scene", SETTINGS)
@@ -213,6 +213,6 @@ def test_settings_that_attaching_does_not_read_and_impossible_words_are_told_bef
 def test_large_photos_are_prepared_at_the_requested_size(tmp_path):
     write_scene(tmp_path / "photos", size=(320, 240), photos=3, points=200, coarseness=4)
     config = settled(replace(SETTINGS, longer_side=120))
-    photos, targets = prepare_photos(read_collection(tmp_path / "photos"), config, tmp_path / "cache", "cpu")
+    photos, targets = prepare_photos(open_capture(tmp_path / "photos"), config, tmp_path / "cache", "cpu")
     assert {(photo.width, photo.height) for photo in photos.photos} == {(120, 90)}
     assert targets.clip(targets.names[0]).features.shape[0] < targets.clip(targets.names[0]).features.shape[1]

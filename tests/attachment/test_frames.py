@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 from box_splat import box_splat
-from lang3dxl_ns.preparation.photo_collection import read_collection
 from moved_splats import transformed, with_colors
 from scenes import write_scene
 from scipy.spatial.transform import Rotation
@@ -16,12 +15,13 @@ from lang3dxl_ns.attachment.frames import Fit, camera_in, find_frame
 from lang3dxl_ns.attachment.known_frames import RUN_TRANSFORM, known_frames, registered_frames
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.rendering import render
+from lang3dxl_ns.scene.capture import open_capture
 
 
 @pytest.fixture(scope="module")
 def collection(tmp_path_factory):
     folder = write_scene(tmp_path_factory.mktemp("box") / "scene", size=(120, 90), photos=8, points=400)
-    return read_collection(folder)
+    return open_capture(folder)
 
 
 def moved(similarity):
@@ -125,7 +125,7 @@ def test_a_transforms_json_is_read_like_the_colmap_model(collection, tmp_path):
         written.append({"file_path": f"./{photo.name}", "transform_matrix": pose.tolist()})
     shared = {"fl_x": lens.fx, "fl_y": lens.fy, "cx": lens.cx, "cy": lens.cy, "w": 120, "h": 90}
     (tmp_path / "transforms.json").write_text(json.dumps({**shared, "frames": written}))
-    found = read_collection(tmp_path)
+    found = open_capture(tmp_path)
     assert [photo.name for photo in found.photos] == [photo.name for photo in collection.photos]
     assert [photo.lens for photo in found.photos] == [photo.lens for photo in collection.photos]
     for name, tracked in found.reconstruction.photos.items():
@@ -148,7 +148,7 @@ def test_a_damaged_photo_or_mask_is_not_compared(tmp_path, damaged):
     photo = tmp_path / "images" / "photo_000.jpg"
     if damaged == "images":
         photo.write_bytes(photo.read_bytes()[:2000])
-    collection = read_collection(tmp_path)
+    collection = open_capture(tmp_path)
     assert find_frame(box_splat(), collection, tmp_path / "a.ply").fits
     for photo in (tmp_path / "images").iterdir():
         photo.write_bytes(photo.read_bytes()[:1500])

@@ -8,7 +8,8 @@ from moved_splats import transformed, with_colors
 from scenes import CENTER, HALF_SIZES
 from scipy.spatial.transform import Rotation
 
-from lang3dxl_ns.attachment import views
+from lang3dxl_ns.attachment import direction_of, views
+from lang3dxl_ns.attachment.upright import Upright
 from lang3dxl_ns.attachment.views import (
     LENS,
     Extent,
@@ -17,6 +18,7 @@ from lang3dxl_ns.attachment.views import (
     rendered_views,
     solids,
 )
+from lang3dxl_ns.common.errors import UserError
 
 SPLATS = box_splat(0.1, ground=True)
 
@@ -35,6 +37,22 @@ def test_up_is_found_wherever_it_points(axis):
     matrix = Rotation.from_rotvec([0.1, -0.1, 0.1]).as_matrix() @ matrix
     found = Extent.of(turned(matrix), "auto").up.numpy()
     assert found @ (matrix @ [0, 0, 1]) > 0.99
+
+
+def test_a_doubtful_up_is_told_with_the_flag_that_sets_the_other(monkeypatch, capsys):
+    for margin, said in ((2.0, "up is about -y"), (0.1, "doubtful: -y (0.00,-1.00,0.10) leads z")):
+        guess = Upright(torch.tensor([0.0, -1, 0.1]), margin, torch.tensor([0.0, 0, 1]))
+        monkeypatch.setattr(views, "find_up", lambda *_, guess=guess: guess)
+        Extent.of(SPLATS, "auto")
+        assert said in (out := " ".join(capsys.readouterr().out.split()))
+    assert "set --up=0.00,0.00,1.00" in out
+
+
+def test_up_is_an_axis_or_three_numbers():
+    assert direction_of("-y") == (0, -1, 0) and direction_of("0,3,-4") == (0, 0.6, -0.8)
+    for wrong in ("up", "", "-", "1,2", "0,0,0", "nan,0,1", "xy"):
+        with pytest.raises(UserError, match="--up is"):
+            direction_of(wrong)
 
 
 def test_a_camera_looks_at_its_target_upright():

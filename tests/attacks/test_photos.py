@@ -38,7 +38,7 @@ def folder(tmp_path):
 def used(folder):
     parser = PhotoCollectionDataParserConfig(data=folder).setup()
     parser.get_dataparser_outputs(split="train")
-    return {photo.name: photo for photo in parser.photos.values()}
+    return {photo.name: photo for photo in parser.capture.photos}
 
 
 def save_as(path, form):
@@ -67,7 +67,7 @@ def test_ghostscript_is_never_asked(tmp_path, monkeypatch):
             read(tmp_path / "a.jpg")
 
 
-@pytest.mark.parametrize("form", FORMATS)
+@pytest.mark.parametrize("form", [form for form in FORMATS if form != "HEIF"])  # which Pillow can't write
 def test_every_format_that_is_named_is_read(folder, form):
     path = folder / "images" / "photo_001.jpg"
     save_as(path, form)
@@ -345,13 +345,13 @@ def test_masks_and_label_maps_that_are_pipes_are_refused(tmp_path):
             companion(tmp_path, "a.jpg", [suffix])
 
 
-def test_masks_that_are_all_black_are_said_to_be(folder):
+def test_masks_that_are_all_dark_are_said_to_be(folder):
     photos = masks(folder, [0, 100, 0, 0])
-    with pytest.raises(UserError, match="all 4 masks are black"):
+    with pytest.raises(UserError, match=r"all 4 masks are dark \(the brightest pixel has 100"):
         masked(photos, folder)
     Image.new("L", (8, 6), 255).save(folder / "masks" / "photo_002.png")
     _, said = masked(photos, folder)
-    assert "the masks of 3 photos are all black" in said
+    assert "the masks of 3 photos are black or dark" in said
 
 
 def test_a_name_too_long_for_a_file_is_one_error(tmp_path):

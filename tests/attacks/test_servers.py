@@ -134,10 +134,25 @@ def test_pages_of_other_origins_are_refused(page, origin):
     assert get(page, "/api/encode?text=x", Origin=origin).status == 403
 
 
+def test_other_sites_may_link_here_and_not_embed_this_server(server):
+    embedded = {"Sec-Fetch-Site": "cross-site", "Sec-Fetch-Mode": "no-cors"}
+    assert get(server, "/api/encode?text=x", **embedded).status == 403
+    assert get(server, "/", **(embedded | {"Sec-Fetch-Mode": "navigate"})).status == 200
+    assert get(server, "/", **(embedded | {"Sec-Fetch-Site": "same-origin"})).status == 200
+
+
 @pytest.mark.parametrize("host", ["127.0.0.1", "127.8.8.8", "::1", "localhost"])
 def test_this_machine_alone_needs_no_token(host):
     access = Access(host, 7007)
     assert not access.needs_token and access.address.endswith(":7007/")
+
+
+def test_a_server_at_all_addresses_names_one_for_other_machines():
+    access = Access("0.0.0.0", 7007)
+    assert "localhost" in access.address and access.elsewhere is not None
+    assert urllib.parse.urlsplit(access.elsewhere).hostname not in ("0.0.0.0", "localhost", "127.0.0.1")
+    assert access.elsewhere.endswith(f":7007/?token={access.token}")
+    assert Access("192.168.1.5", 7007).elsewhere is None
 
 
 @pytest.mark.parametrize("host", ["0.0.0.0", "", "::", "192.168.1.5", "my-machine", "128.0.0.1"])

@@ -1,17 +1,18 @@
-"""A transforms.json of a stranger: checked as COLMAP models are, before nerfstudio reads it."""
+"""A transforms.json of a stranger: checked as COLMAP models are."""
 
 import json
 import math
 import os
+import re
 
 import pytest
-from lang3dxl_ns.preparation.photo_collection import read_collection
-from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from PIL import Image
 
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.plugin.nerfstudio_scenes import check_transforms
+from lang3dxl_ns.scene.capture import open_capture
 
+PLY = "ply\nformat ascii 1.0\nelement vertex 1\n" + "".join(f"property float {a}\n" for a in "xyz")
+PLY += "".join(f"property uchar {c}\n" for c in ("red", "green", "blue")) + "end_header\n1 2 3 9 8 7\n"
 POSE = [[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 2], [0, 0, 0, 1]]
 
 
@@ -29,18 +30,18 @@ def write(folder, text=None, top=None, **frame):
     content = {"camera_model": "OPENCV", "w": 40, "h": 30, "fl_x": 50.0, "fl_y": 51.0, "cx": 20.0, "cy": 15.0}
     content |= {"frames": [whole | frame]} | (top or {})
     (folder / "transforms.json").write_text(json.dumps(content) if text is None else text)
-    return NerfstudioDataParserConfig(data=folder)
+    return folder
 
 
 def test_a_sound_scene_passes_and_one_without_points_is_told(folder, capsys):
-    check_transforms(write(folder))
+    open_capture(write(folder))
     assert "names no points" in capsys.readouterr().out
-    (folder / "points.ply").write_text("ply")
-    check_transforms(write(folder, top={"ply_file_path": "points.ply"}))
-    assert not capsys.readouterr().out
-    check_transforms(write(folder, file_path=str(folder / "images" / "a.png")))
+    (folder / "points.ply").write_text(PLY)
+    found = open_capture(write(folder, top={"ply_file_path": "points.ply"}))
+    assert found.reconstruction.points.tolist() == [[1, 2, 3]] and not capsys.readouterr().out
+    open_capture(write(folder, file_path=str(folder / "images" / "a.png")))
     os.symlink(folder / "images", folder / "linked")
-    check_transforms(write(folder, file_path="linked/a.png"))
+    open_capture(write(folder, file_path="linked/a.png"))
 
 
 @pytest.mark.parametrize(
@@ -55,24 +56,36 @@ def test_a_sound_scene_passes_and_one_without_points_is_told(folder, capsys):
         {"k1": math.nan},
         {"file_path": None},
         {"file_path": 3},
-        *({key: "../secret.png"} for key in ("file_path", "mask_path", "depth_file_path")),
-        *({key: "/etc/hostname"} for key in ("file_path", "mask_path", "depth_file_path")),
-        {"file_path": "a\0b"},
-        {"file_path": "images/a"},
-        {"transform_matrix": POSE[:3]},
-        {"is_fisheye": True},
+        {"transform_matrix": [[2.0, 0, 0, 0], *POSE[1:]]},
+        {"transform_matrix": [[-1.0, 0, 0, 0], *POSE[1:]]},
+        {"transform_matrix": [list(row) for row in zip(*POSE, strict=True)]},
+        {"camera_angle_x": 4.0, "fl_x": None},
+        {"distortion_params": [0, 0, 0, 0, "a", 0]},
     ],
 )
-def test_frames_that_nothing_can_be_rendered_from_or_that_lead_outside_are_named(folder, frame):
+def test_frames_that_nothing_can_be_rendered_from_are_named(folder, frame):
     with pytest.raises(UserError, match=r"transforms\.json can't be used"):
-        check_transforms(write(folder, **frame))
+        open_capture(write(folder, **frame))
+
+
+@pytest.mark.parametrize("key", ["file_path", "mask_path"])
+@pytest.mark.parametrize("name", ["../secret.png", "/etc/hostname", "a\0b", "..", "images", "~/secret.png"])
+def test_names_that_lead_outside_or_nowhere_are_named_and_never_opened(folder, key, name):
+    with pytest.raises(UserError, match="none of the 1 photos"):
+        open_capture(write(folder, **{key: name}))
+
+
+@pytest.mark.parametrize("frame", [{"file_path": "images/a"}, {"transform_matrix": POSE[:3]}])
+def test_what_other_programs_leave_out_is_understood(folder, frame):
+    (photo,) = open_capture(write(folder, **frame)).photos
+    assert photo.name == "images/a.png"
 
 
 @pytest.mark.parametrize("key", ["file_path", "mask_path"])
 def test_links_that_lead_outside_are_refused(folder, key):
     os.symlink(folder.parent / "secret.png", folder / "images" / "link.png")
     with pytest.raises(UserError, match="leads out of"):
-        check_transforms(write(folder, **{key: "images/link.png"}))
+        open_capture(write(folder, **{key: "images/link.png"}))
 
 
 @pytest.mark.parametrize(
@@ -81,8 +94,6 @@ def test_links_that_lead_outside_are_refused(folder, key):
         {"frames": []},
         {"frames": None},
         {"frames": [3]},
-        {"camera_model": "NOSUCH"},
-        {"camera_model": ["OPENCV"]},
         {"ply_file_path": "../secret.ply"},
         {"ply_file_path": 3},
         {"train_filenames": ["../secret.png"]},
@@ -92,52 +103,53 @@ def test_links_that_lead_outside_are_refused(folder, key):
 )
 def test_scenes_that_are_none_are_named(folder, top):
     with pytest.raises(UserError, match=r"transforms\.json can't be used"):
-        check_transforms(write(folder, top=top))
+        open_capture(write(folder, top=top))
 
 
 @pytest.mark.parametrize("text", ["", "\x00\xff", "null", "[]", "3", "[" * 100_000])
 def test_files_that_are_no_json_are_named(folder, text):
     with pytest.raises(UserError, match=r"transforms\.json can't be used"):
-        check_transforms(write(folder, text=text))
+        open_capture(write(folder, text=text))
+
+
+@pytest.mark.parametrize("model", ["NOSUCH", ["OPENCV"], "EQUIRECTANGULAR", "ORTHOPHOTO"])
+def test_unknown_camera_models_are_told_by_name(folder, model):
+    with pytest.raises(UserError, match=re.escape(f"has a {model} camera")):
+        open_capture(write(folder, top={"camera_model": model}))
 
 
 def test_pipes_are_refused_instead_of_waited_for(folder):
     os.mkfifo(folder / "transforms.json")
     with pytest.raises(UserError, match="not a regular file"):
-        check_transforms(NerfstudioDataParserConfig(data=folder))
+        open_capture(folder)
     (folder / "transforms.json").unlink()
     os.mkfifo(folder / "images" / "pipe.png")
-    with pytest.raises(UserError, match="not a regular file"):
-        check_transforms(write(folder, mask_path="images/pipe.png"))
+    with pytest.raises(UserError, match="none of the 1 photos"):
+        open_capture(write(folder, mask_path="images/pipe.png"))
 
 
-@pytest.mark.parametrize(
-    "top", [{}, {"applied_transform": POSE}, {"train_filenames": ["images/other.png"]}]
-)  # a single place, and two that only nerfstudio notices
-def test_what_nerfstudio_can_not_read_is_one_sentence(folder, train, top):
-    write(folder, top=top)
-    with pytest.raises(UserError, match=r"nerfstudio can't read .*: make it again"):
-        train(folder, semantics=False)
+def test_a_list_of_photos_that_are_not_there_is_told(folder):
+    with pytest.raises(UserError, match=r"train_filenames names .*other"):
+        open_capture(write(folder, top={"train_filenames": ["images/other.png"]}))
 
 
-def test_a_byte_order_mark_is_one_sentence(folder, train):
+def test_a_byte_order_mark_is_passed_over(folder):
     write(folder)
     text = (folder / "transforms.json").read_text()
     (folder / "transforms.json").write_text(text, encoding="utf-8-sig")
-    with pytest.raises(UserError, match=r"nerfstudio can't read .*BOM"):
-        train(folder, semantics=False)
+    assert len(open_capture(folder).photos) == 1
 
 
 @pytest.mark.parametrize("name", ["images/a", "./images/a.png", ".//images/a", "images/../images/a.png"])
 def test_a_splats_photos_are_found_without_suffix_and_by_every_relative_name(folder, name):
-    (photo,) = read_collection(folder_of(folder, name)).photos
+    (photo,) = open_capture(folder_of(folder, name)).photos
     assert photo.name == "images/a.png"
 
 
 @pytest.mark.parametrize(("name", "file"), [("images/b.2020", "b.2020.JPEG"), ("images/c", "c.webp")])
 def test_names_with_dots_and_large_suffixes_are_found(folder, name, file):
     Image.new("RGB", (40, 30)).save(folder / "images" / file)
-    (photo,) = read_collection(folder_of(folder, name)).photos
+    (photo,) = open_capture(folder_of(folder, name)).photos
     assert photo.name == f"images/{file}"
 
 
@@ -150,7 +162,7 @@ def folder_of(folder, name):
 @pytest.mark.parametrize("fisheye", [True, False])
 def test_lenses_of_instant_ngp_are_fisheyes_where_it_says_so(folder, fisheye):
     write(folder, is_fisheye=fisheye, k1=0.1)
-    (photo,) = read_collection(folder).photos
+    (photo,) = open_capture(folder).photos
     assert photo.lens.fisheye == fisheye and photo.lens.distortion[0] == 0.1
 
 

@@ -144,6 +144,7 @@ def test_a_figure_that_is_not_finite_gives_no_result(tmp_path, monkeypatch):
     assert "not finite: map" in failed[run]
 
 
+@pytest.mark.nerfstudio
 def test_rows_change_one_setting_each_of_those_that_a_run_has():
     from lang3dxl_ns.methods import lang3dxl
 
@@ -156,6 +157,7 @@ def test_rows_change_one_setting_each_of_those_that_a_run_has():
         apply_changes(deepcopy(lang3dxl.config), {"pipeline.model.no_such_setting": 1})
 
 
+@pytest.mark.nerfstudio
 def test_flags_of_all_rows_are_read_as_ns_train_reads_them(tmp_path):
     """Switches take True or False, as `lang3dxl preset official` prints them."""
     flags = replace(settings(), flags=" ".join(train_flags("official")))
@@ -206,6 +208,7 @@ def figures_of_two_scenes() -> dict[Run, dict[str, float]]:
 
 
 def test_the_report_gives_deviations_over_seeds_of_means_over_scenes(tmp_path):
+    pytest.importorskip("matplotlib")
     figures = figures_of_two_scenes()
     rows = [BY_NAME[name] for name in (FULL, TEACHER, CLIPSEG)]
     failed = {Run(BY_NAME[CLIPSEG], Path("here"), "here", 0): "no weights"}
@@ -225,6 +228,7 @@ def test_the_report_gives_deviations_over_seeds_of_means_over_scenes(tmp_path):
     assert len(lines) == len(figures)
 
 
+@pytest.mark.nerfstudio
 def test_a_seed_that_lacks_a_scene_is_left_out_of_the_mean_over_scenes(tmp_path):
     figures = figures_of_two_scenes()
     figures.popitem()
@@ -304,6 +308,7 @@ def test_the_command_trains_scores_and_reports(tmp_path, capsys):
     assert (out / "results/scene/full/4-0.json").stat().st_mtime_ns == stamp
 
 
+@pytest.mark.nerfstudio
 def test_labels_of_held_out_photos_alone_are_enough(tmp_path):
     photos = [SimpleNamespace(name="a.jpg"), SimpleNamespace(name="b.jpg")]
     pipeline = SimpleNamespace(

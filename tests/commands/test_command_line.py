@@ -44,7 +44,11 @@ def test_without_words_the_help_is_shown(capsys):
         (["query", "none", "--out", "found"], "there is no --text"),
         (["query", "none", "--text", " ; ", "--out", "found"], "the prompt is empty"),
         (["prepare", "--data", "nowhere", "--clip", "nobody/nothing"], "nowhere is not a folder"),
-        (["prepare", "--data", ".", "--crop-batch", "0", "--clip", "builtin"], "--crop-batch is 0"),
+        pytest.param(
+            ["prepare", "--data", ".", "--crop-batch", "0", "--clip", "builtin"],
+            "--crop-batch is 0",
+            marks=pytest.mark.nerfstudio,
+        ),
         (["demo", "--photos", "0"], "--photos is 0"),
         (["demo", "--steps", "-5"], "--steps is -5"),
         (["view", "none", "--port", "99999"], "the port is 99999"),

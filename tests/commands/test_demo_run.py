@@ -10,7 +10,7 @@ from lab.landmark import scene_writer
 from lab.landmark.demo import Demo
 from lang3dxl_ns.common.errors import UserError
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.nerfstudio]
 
 
 SCENE = {"photos": 8, "test_views": 3, "quick": True, "wild": False}

@@ -1,8 +1,11 @@
 """`lang3dxl doctor`: its checks and their remedies."""
 
+import sys
+
 import pytest
 import torch
 
+from lang3dxl_ns import UserError, cli, load_scene
 from lang3dxl_ns.cli import main
 from lang3dxl_ns.commands import doctor
 
@@ -54,10 +57,35 @@ def test_versions_are_checked_against_the_requirements(monkeypatch):
     monkeypatch.setattr(doctor, "version", lambda name: "1.0" if name == "gsplat" else "9999.1")
     monkeypatch.setattr(doctor, "requires", lambda _: ["gsplat==1.4.0", "torch>=2.6", "ray; extra == 'ray'"])
     found = {finding.what: finding for finding in doctor.versions()}
-    assert set(found) == {"Python", "gsplat", "torch"}
+    assert set(found) == {"Python", "nerfstudio", "gsplat", "torch"}
     assert found["torch"].verdict == "ok"
     assert found["gsplat"].verdict == "problem"
     assert "gsplat==1.4.0" in found["gsplat"].remedy
     monkeypatch.setattr(doctor, "findings", lambda: iter([found["gsplat"]]))
     with pytest.raises(SystemExit, match="1 problem"):
         main(["doctor"])
+
+
+@pytest.mark.parametrize(("python", "says"), [((3, 13, 1), "3.10 to 3.12"), ((3, 11, 2), "pip install")])
+def test_the_half_that_is_not_installed_is_a_note_with_its_reason(monkeypatch, python, says):
+    monkeypatch.setattr(doctor, "find_spec", lambda _: None)
+    monkeypatch.setattr(doctor.sys, "version_info", python)
+    need = "nerfstudio==1.1.5; python_version < '3.13' and extra == 'nerfstudio'"
+    monkeypatch.setattr(doctor, "requires", lambda _: [need])
+    _, half = doctor.versions()  # Python itself, and nothing of the half that is missing
+    assert half.verdict == "note" and says in half.remedy
+
+
+def test_a_command_that_needs_nerfstudio_says_how_to_install_it(monkeypatch, tmp_path):
+    def main(self):
+        raise ModuleNotFoundError("No module named 'nerfstudio'", name="nerfstudio.cameras")
+
+    monkeypatch.setattr(doctor.Doctor, "main", main)
+    with pytest.raises(SystemExit, match=r"\.\[nerfstudio\]"):
+        cli.main(["doctor"])
+    monkeypatch.setitem(sys.modules, "nerfstudio", None)
+    monkeypatch.setitem(sys.modules, "nerfstudio.data.scene_box", None)
+    monkeypatch.delitem(sys.modules, "lang3dxl_ns.plugin.load_scene", raising=False)
+    (tmp_path / "config.yml").write_text("x")
+    with pytest.raises(UserError, match=r"\.\[nerfstudio\]"):
+        load_scene(tmp_path)

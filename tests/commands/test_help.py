@@ -60,6 +60,7 @@ def count() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.nerfstudio
 def test_ns_train_shows_at_most_80_settings_and_our_commands_120_flags():
     code = "import sys; sys.argv = ['lang3dxl', '--help']; from commands.test_help import count; count()"
     done = subprocess.run(

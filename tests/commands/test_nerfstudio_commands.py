@@ -13,7 +13,7 @@ from processes import output as command
 from processes import run as attempt
 from scenes import write_scene
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.nerfstudio]
 FEW = (
     *("--pipeline.model.decoder.compression.steps", 40),
     *("--pipeline.model.decoder.compression.batch", 512),

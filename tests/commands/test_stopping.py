@@ -40,6 +40,7 @@ def stop(place: str, function: str, number: signal.Signals, arguments: list[str]
 
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.nerfstudio
 def test_a_stopped_preparation_keeps_its_photos_and_goes_on(scene, tiny_clip, tmp_path, capsys, number):
     arguments = ["prepare", "--data", str(scene), "--cache-dir", str(tmp_path), "--clip", str(tiny_clip)]
     arguments += ["--dense", "none", "--crops", "pyramid"]

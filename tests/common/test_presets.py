@@ -29,6 +29,7 @@ def test_a_preset_that_is_not_a_scene_has_no_flags():
 
 
 @pytest.mark.slow
+@pytest.mark.nerfstudio
 def test_training_takes_the_flags_of_every_scene(capsys):
     """As `ns-train lang3dxl-paper` would parse them, those of the authors' release after a scene's."""
     from copy import deepcopy

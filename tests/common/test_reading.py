@@ -5,6 +5,7 @@ import struct
 
 import numpy as np
 import pytest
+import torch
 
 from lab.stages import MeasuredStages
 from lang3dxl_ns.common.errors import UserError
@@ -77,3 +78,36 @@ def test_damaged_figures_of_earlier_stages_are_forgotten(tmp_path, content):
         "seconds": {},
         "peak_mb": {},
     }
+
+
+@pytest.mark.parametrize("full", [MemoryError(), RuntimeError("DefaultCPUAllocator: can't allocate memory")])
+def test_no_file_is_blamed_for_a_full_memory(full, tmp_path, monkeypatch):
+    """Every reader that calls errors of its libraries damage lets a full memory through."""
+    import safetensors
+    from painted_scene import painted_scene
+    from PIL import Image
+
+    from lang3dxl_ns.common.errors import readable
+    from lang3dxl_ns.common.pictures import open_picture
+    from lang3dxl_ns.files.read_splats import read_splats
+    from lang3dxl_ns.files.scene_file import read_scene, write_scene
+    from lang3dxl_ns.plugin.run_checkpoint import read_checkpoint
+
+    def fails(*_, **__):
+        raise full
+
+    write_scene(tmp_path / "a.scene", painted_scene())
+    painted_scene().export(tmp_path / "a.ply")
+    torch.save({"pipeline": {}, "step": 1}, tmp_path / "a.ckpt")
+    Image.new("RGB", (8, 8)).save(tmp_path / "a.png")
+    with pytest.raises(type(full)), readable("x is damaged", "copy it"):
+        fails()
+    with pytest.raises(type(full)), open_picture(tmp_path / "a.png"):
+        fails()
+    monkeypatch.setattr(safetensors, "safe_open", fails)
+    monkeypatch.setattr(np, "frombuffer", fails)
+    monkeypatch.setattr(np, "fromfile", fails)
+    monkeypatch.setattr(torch, "load", fails)
+    for read, name in ((read_scene, "a.scene"), (read_splats, "a.ply"), (read_checkpoint, "a.ckpt")):
+        with pytest.raises(type(full)):
+            read(tmp_path / name)

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from lang3dxl_ns.training import learn_codes
+from lang3dxl_ns.training import sharpening
 from lang3dxl_ns.training.sharpening import sharpen
 
 
@@ -79,13 +79,13 @@ def test_one_look():
 def test_how_many_are_read_at_a_time_does_not_matter(monkeypatch):
     features, dense, mass, _ = scene()
     expected = sharpen(features, dense, mass)
-    monkeypatch.setattr(learn_codes, "_ROWS", 17)
+    monkeypatch.setattr(sharpening, "_ROWS", 17)
     torch.testing.assert_close(sharpen(features, dense, mass), expected, rtol=0, atol=1e-12)
 
 
 def test_groups_found_from_a_sample_do_for_all(monkeypatch):
     features, dense, mass, truth = scene()
-    monkeypatch.setattr(learn_codes, "_SAMPLE", 500)
+    monkeypatch.setattr(sharpening, "_SAMPLE", 500)
     seen, after = mass > 0, sharpen(features, dense, mass)
     assert (after - truth)[seen].square().mean() < 0.6 * (features - truth)[seen].square().mean()
 

@@ -9,7 +9,7 @@ from lang3dxl_ns.files.read_splats import read_splats
 from lang3dxl_ns.files.splat_file import write_splats
 from lang3dxl_ns.rendering import Gaussians, rasterize, spherical_harmonics
 from lang3dxl_ns.scene.camera import Lens
-from lang3dxl_ns.training.initialization import FREE, LONGEST, NEEDLE, keep_in_bounds
+from lang3dxl_ns.training.gaussians import FREE, LONGEST, NEEDLE, keep_in_bounds
 
 SKY = 40
 """Few, so that they are large."""
@@ -26,9 +26,9 @@ def planted(scene, tiny_clip, tiny_dense, tmp_path):
         model, g = trainer.pipeline.model, trainer.pipeline.model.gauss_params
         with torch.no_grad():
             pose = trainer.pipeline.datamanager.train_dataset.cameras.camera_to_worlds[3]
-            g["means"][-1] = pose[:, 3] - 0.5 * FREE * model.extent[1] * pose[:, 2]
+            g["means"][-1] = pose[:, 3] - 0.5 * FREE * model.run.extent[1] * pose[:, 2]
             g["scales"][-1] = -9.0
-            g["scales"][-2, 0] = np.log(40 * model.extent[1])
+            g["scales"][-2, 0] = np.log(40 * model.run.extent[1])
             g["opacities"][-3:] = 4.0
             if model.config.sh_degree:
                 g["features_dc"][-3], g["features_rest"][-3] = 9.0, 9.0
@@ -47,14 +47,14 @@ def distances(trainer) -> torch.Tensor:
 def test_pruning_clears_the_space_at_the_cameras_and_keeps_the_sky(planted):
     trainer, sky = planted()
     model = trainer.pipeline.model
-    assert distances(trainer).min() > FREE * model.extent[1]
+    assert distances(trainer).min() > FREE * model.run.extent[1]
     assert torch.equal(model.gauss_params["scales"][:SKY], sky)
 
 
 def test_no_needle_stays_and_the_sky_keeps_its_size(planted):
     trainer, sky = planted(pipeline__model__densify_until=0.0)
     model = trainer.pipeline.model
-    center, radius = model.extent
+    center, radius = model.run.extent
     _, wide, longest = model.scales.detach().exp().sort(dim=1).values.unbind(1)
     away = (model.means.detach() - center).norm(dim=1).clamp_min(radius)
     bound = (2 * wide).maximum(NEEDLE * away).minimum(LONGEST * away)
@@ -87,7 +87,7 @@ def test_exported_colors_are_near_0_to_1_from_everywhere(planted, tmp_path):
 
 def test_a_scene_without_points_is_bounded_too(planted):
     trainer, _ = planted(pipeline__model__random_init=True, pipeline__model__num_random=300)
-    assert distances(trainer).min() > FREE * trainer.pipeline.model.extent[1]
+    assert distances(trainer).min() > FREE * trainer.pipeline.model.run.extent[1]
 
 
 def test_one_beside_the_camera_does_not_cover_the_picture():

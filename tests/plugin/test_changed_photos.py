@@ -1,8 +1,6 @@
 """Runs whose photos change, vanish or are damaged between their parts."""
 
-import os
 import shutil
-import signal
 from copy import deepcopy
 from pathlib import Path
 
@@ -15,7 +13,6 @@ from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.files.scene_file import describe_scene_file, read_scene
 from lang3dxl_ns.files.scene_file import write_scene as write_scene_file
 from lang3dxl_ns.methods import lang3dxl
-from lang3dxl_ns.open_scene import train as train_scene
 from lang3dxl_ns.plugin.trainer import Lang3DXLTrainer
 from lang3dxl_ns.plugin.trainer_config import open_run, read_config
 from lang3dxl_ns.scene.record import SCENE_FILE, SceneRecord
@@ -153,20 +150,6 @@ def test_a_target_that_vanishes_does_not_end_the_learning_of_words(train, tmp_pa
 
     monkeypatch.setattr(Lang3DXLTrainer, "train", without_one)
     assert train(data, 2).words_are_learned
-
-
-def test_ctrl_c_in_training_from_python_is_the_error_that_it_promises(tmp_path, monkeypatch):
-    step = Lang3DXLTrainer.train_iteration
-
-    def stopped(self, number):
-        if number == 2:
-            os.kill(os.getpid(), signal.SIGINT)
-        return step(self, number)
-
-    monkeypatch.setattr(Lang3DXLTrainer, "train_iteration", stopped)
-    data = write_scene(tmp_path / "scene", photos=4, points=60)
-    with pytest.raises(UserError, match="training was stopped; to resume"):
-        train_scene(data, tmp_path / "out", iterations=6, clip="none", dense="none")
 
 
 def test_a_relative_cache_is_found_from_any_folder(train, tmp_path, monkeypatch):

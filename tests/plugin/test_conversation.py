@@ -1,6 +1,6 @@
 """Questions to a model that changes meanwhile: each answer is of one snapshot and one question."""
 
-from contextlib import nullcontext
+from contextlib import contextmanager, nullcontext
 from types import SimpleNamespace
 
 import pytest
@@ -74,3 +74,21 @@ def test_a_question_that_comes_while_a_frame_is_rendered_waits_for_the_next(talk
     assert "relevancy_1" in frame(talk, model)
     found = frame(talk, model, between=talk.forget)
     assert "relevancy_1" in found and set(frame(talk, model)) == {"overlay"}
+
+
+def test_a_question_that_waited_while_the_final_words_were_learned_keeps_them(talk, model):
+    """The words of the end are learned under the lock that the snapshot waits for: it must not learn its own
+    over them, nor delete them afterwards."""
+    told = []
+    model.semantic_field = SimpleNamespace(needs_lifting=True)
+    model.forget_gathered_codes = lambda: told.append("forgotten")
+    talk.learn = lambda: told.append("learned")
+
+    @contextmanager
+    def training_ends():
+        model.training = False
+        yield
+
+    talk.lock = training_ends()
+    talk.ask("dome")
+    assert told == [] and talk._scene_step is None

@@ -9,14 +9,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 import scenes
-from lang3dxl_ns.preparation.photo_collection import images_path
+import torch
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from PIL import Image
 from scenes import speckled, write_scene
+from scipy.spatial.transform import Rotation
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.plugin.datamanager import Lang3DXLDataManagerConfig
 from lang3dxl_ns.plugin.dataparser import PhotoCollectionDataParserConfig, parser_for
+from lang3dxl_ns.scene.capture import images_path
 from lang3dxl_ns.scene.photo_folder import _sharpest, extract_frames
 
 needs_ffmpeg = pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="ffmpeg is not installed")
@@ -91,19 +93,36 @@ def test_the_model_of_other_photos_in_a_shared_cache_is_not_used(walk, tmp_path)
     assert own == [False, True]
 
 
-def test_a_folder_with_transforms_is_read_as_nerfstudio_does(tmp_path):
-    data = tmp_path / "data"
+def write_transforms(data, count=12):
+    """A row of photos with a transforms.json."""
     data.mkdir()
     frames = []
-    for i in range(12):
+    for i in range(count):
         Image.fromarray(np.full((6, 8, 3), 20 * i, np.uint8)).save(data / f"{i}.png")
         pose = np.eye(4)
-        pose[0, 3] = i
+        pose[:3, :3] = Rotation.from_rotvec([0.3, 0.02 * i, -0.1]).as_matrix()
+        pose[:3, 3] = [i, 0.2 * i * i, 3]
         frames.append({"file_path": f"{i}.png", "transform_matrix": pose.tolist()})
     lens = {"fl_x": 9.0, "fl_y": 9.0, "cx": 4.0, "cy": 3.0, "w": 8, "h": 6}
-    (data / "transforms.json").write_text(json.dumps({**lens, "frames": frames}))
-    parser = parser_for(PhotoCollectionDataParserConfig(data=data), None, True)
-    assert isinstance(parser, NerfstudioDataParserConfig)
+    moved = {"applied_transform": [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]]}
+    (data / "transforms.json").write_text(json.dumps({**lens, **moved, "frames": frames}))
+    return data
+
+
+def test_a_folder_with_transforms_is_read_in_nerfstudios_frame_and_split(tmp_path):
+    """Runs that began with nerfstudio's own reader go on with the same cameras."""
+    data = write_transforms(tmp_path / "data")
+    theirs = NerfstudioDataParserConfig(data=data)
+    ours = parser_for(NerfstudioDataParserConfig(data=data), None, True)
+    assert isinstance(ours, PhotoCollectionDataParserConfig)
+    for split in ("train", "val"):
+        a, b = (parser.setup().get_dataparser_outputs(split) for parser in (theirs, ours))
+        assert [path.name for path in a.image_filenames] == [path.name for path in b.image_filenames]
+        torch.testing.assert_close(
+            a.cameras.camera_to_worlds, b.cameras.camera_to_worlds, atol=1e-5, rtol=1e-5
+        )
+        torch.testing.assert_close(a.dataparser_transform, b.dataparser_transform, atol=1e-5, rtol=1e-5)
+        assert a.dataparser_scale == pytest.approx(b.dataparser_scale)
     manager = datamanager(data)
     assert len(manager.train_dataset) + len(manager.eval_dataset) == 12
 

@@ -18,7 +18,7 @@ from lang3dxl_ns.preparation.photo_cache import PhotoCache
 from lang3dxl_ns.preparation.store import FeatureStore
 from lang3dxl_ns.preparation.working_photos import WorkingPhotos
 from lang3dxl_ns.scene.camera import view_matrix
-from lang3dxl_ns.training.initialization import sphere_around
+from lang3dxl_ns.training.gaussians import sphere_around
 
 
 def photo(index: int) -> dict[str, torch.Tensor]:
@@ -110,7 +110,7 @@ def test_points_project_to_their_observations_through_the_whole_chain(scene, sca
     parser = PhotoCollectionDataParserConfig(data=scene).setup()
     outputs = parser.get_dataparser_outputs(split="train")
     dataset = PhotoDataset(outputs, scale, WorkingPhotos(FeatureStore(scene / "cache")))
-    geometries = parser.reconstruction.photos
+    geometries = parser.capture.reconstruction.photos
     transform, world_scale = outputs.dataparser_transform, outputs.dataparser_scale
     for i, taken in enumerate(dataset.photos):
         geometry, camera = geometries[taken.name], dataset.cameras[i]

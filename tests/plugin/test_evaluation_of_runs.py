@@ -17,6 +17,10 @@ from lang3dxl_ns.evaluation.score_scene import score_scene
 from lang3dxl_ns.plugin.dataparser import PhotoCollectionDataParserConfig
 from lang3dxl_ns.plugin.load_scene import load_run
 from lang3dxl_ns.plugin.trainer_config import open_run
+from lang3dxl_ns.scene.camera import Lens
+from lang3dxl_ns.scene.capture import Capture, CaptureSettings
+from lang3dxl_ns.scene.colmap import Reconstruction
+from lang3dxl_ns.scene.photo import Photo
 
 
 def label(scene, folder, numbers):
@@ -155,11 +159,18 @@ def test_a_listed_photo_that_is_not_there_is_named(scene, tmp_path):
         split(scene, "photo_099\n", tmp_path)
 
 
+def listed(folder, *names):
+    """A capture of such photos, of which the list in the folder is held out."""
+    lens, nothing = Lens(4, 4, 4.0, 4.0, 2.0, 2.0), np.zeros((0, 3))
+    photos = [Photo(name, folder / name, None, lens) for name in names]
+    settings = CaptureSettings(held_out=folder / "held_out.txt")
+    return Capture(folder, photos, Reconstruction({}, nothing, nothing), settings=settings)
+
+
 @pytest.mark.parametrize("name", ["seq/b.jpg", "seq/b", "b.jpg", "b"])
 def test_a_photo_may_be_listed_without_its_folder_and_its_suffix(tmp_path, name):
     (tmp_path / "held_out.txt").write_text(name)
-    parser = PhotoCollectionDataParserConfig(held_out=tmp_path / "held_out.txt").setup()
-    assert parser._held_out(["seq/a.jpg", "seq/b.jpg"]) == [1]
+    assert listed(tmp_path, "seq/a.jpg", "seq/b.jpg").split == (("seq/a.jpg",), ("seq/b.jpg",))
 
 
 def test_folders_of_pt_ovs_are_read_as_published(scene, tmp_path):
@@ -211,5 +222,5 @@ def test_a_run_of_other_photos_keeps_its_cameras_and_is_not_evaluated(train, tmp
 def test_a_photo_listed_by_its_whole_name_is_that_one(tmp_path):
     """Also if another folder holds one of the same file name."""
     (tmp_path / "held_out.txt").write_text("a.jpg\nday/b.jpg")
-    parser = PhotoCollectionDataParserConfig(held_out=tmp_path / "held_out.txt").setup()
-    assert parser._held_out(["a.jpg", "day/a.jpg", "day/b.jpg", "day/b.png"]) == [0, 2]
+    found = listed(tmp_path, "a.jpg", "day/a.jpg", "day/b.jpg", "day/b.png")
+    assert found.split.held_out == ("a.jpg", "day/b.jpg")

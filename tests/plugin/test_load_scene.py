@@ -133,7 +133,7 @@ def test_cameras_are_those_that_were_trained_with(scene, trainer):
 
 def test_the_files_frame_leads_back_to_colmaps(scene, trainer):
     """scale · (transform · COLMAP's camera center) is the camera's center in the model."""
-    reconstruction = trainer.pipeline.datamanager.dataparser.reconstruction
+    reconstruction = trainer.pipeline.datamanager.reconstruction
     transform = torch.tensor(scene.file.transform, dtype=torch.float64)
     for photo in scene.file.photos:
         pose = torch.from_numpy(reconstruction.photos[photo.name].camera_from_world)

@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from lang3dxl_ns.methods import lang3dxl
-from lang3dxl_ns.plugin.optimizers import LONG_RUN, SHORT_RUN, RunAdamConfig, RunScheduleConfig
+from lang3dxl_ns.plugin.optimizers import RunAdamConfig, RunScheduleConfig
+from lang3dxl_ns.training.learning_rates import LONG_RUN, SHORT_RUN
 
 
 @pytest.mark.parametrize("steps", [10, 1000, 30_000])

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from lang3dxl_ns.plugin.optimizers import (
+from lang3dxl_ns.training.learning_rates import (
     cosine_decay,
     log_linear,
     semantic_ramp,

@@ -7,7 +7,7 @@ from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.components.sky import OPACITY, Sky
 from lang3dxl_ns.plugin.model import Lang3DXLModel
 from lang3dxl_ns.rendering import Gaussians
-from lang3dxl_ns.training.initialization import sphere_around
+from lang3dxl_ns.training.gaussians import colors_seen, sphere_around
 
 COUNT = 200
 ONE_LIGHT = {"pipeline__model__appearance__use": "off"}
@@ -75,7 +75,7 @@ def test_trained_it_is_gaussians_like_any_others(train, scene):
         model = trained(train, scene, pipeline__model__view_dependence=view_dependence).eval()
         model.step = 10_000
         dc, sky = model.gauss_params["features_dc"][:COUNT], model.sky.colors
-        shown = model.colors_from(model.gauss_params, torch.zeros(3))[:COUNT]
+        shown = colors_seen(model.gauss_params, model.run.degree, torch.zeros(3))[:COUNT]
         torch.testing.assert_close(shown, sky.clamp(1e-4, 1 - 1e-4), atol=1e-4, rtol=0)
         assert dc.std() > 0
 
@@ -85,7 +85,7 @@ def test_trained_it_is_gaussians_like_any_others(train, scene):
 )
 def test_without_a_sky_and_with_looks_there_is_nothing_of_it(train, scene, changes):
     model = trained(train, scene, 1, **changes)
-    assert model.sky is None and "sky" not in model.get_param_groups() and model.strategy.still == 0
+    assert model.sky is None and "sky" not in model.get_param_groups() and model.run.densification.still == 0
     assert not [name for name in model.state_dict() if name.startswith("sky")]
 
 
@@ -94,7 +94,7 @@ def test_a_resumed_run_trains_the_sky_that_it_began_with(train, scene):
     first = train(scene, iterations=4, semantics=False, pipeline__model__sky_gaussians=COUNT, **ONE_LIGHT)
     place = {"load_dir": first.checkpoint_dir, "iterations": 8, "semantics": False, **ONE_LIGHT}
     again = train(scene, pipeline__model__sky_gaussians=50, **place).pipeline.model
-    assert len(again.sky) == again.strategy.still == COUNT
+    assert len(again.sky) == again.run.densification.still == COUNT
     assert not torch.equal(again.sky.harmonics, first.pipeline.model.sky.harmonics)
     with pytest.raises(UserError, match="was trained with sky, which the present settings leave out"):
         train(scene, pipeline__model__sky_gaussians=0, **place)
@@ -106,7 +106,7 @@ def test_a_checkpoint_brings_a_sky_of_its_own_size_or_none_as_before_it_was_smoo
     state = first.state_dict()
     second.load_state_dict(state, strict=True)
     torch.testing.assert_close(second.sky.colors, first.sky.colors)
-    assert second.strategy.still == COUNT
+    assert second.run.densification.still == COUNT
     without = {name: value for name, value in state.items() if not name.startswith("sky")}
     second.load_state_dict(without, strict=True)
-    assert second.sky is None and second.strategy.still == 0
+    assert second.sky is None and second.run.densification.still == 0

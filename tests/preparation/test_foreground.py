@@ -12,11 +12,12 @@ from tiny_models import make_tiny_clipseg
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.preparation import foreground
-from lang3dxl_ns.preparation.foreground import find_mask, foreground_kind, with_foreground
+from lang3dxl_ns.preparation.foreground import foreground_kind, with_foreground
 from lang3dxl_ns.preparation.segmentation import ClipSeg
 from lang3dxl_ns.preparation.settings import PreparationConfig
 from lang3dxl_ns.preparation.store import FeatureStore
 from lang3dxl_ns.scene.camera import Lens
+from lang3dxl_ns.scene.masks import find_mask
 from lang3dxl_ns.scene.photo import Photo
 
 NAMES = ["north/a.png", "north/b.png", "c.png"]

@@ -21,7 +21,7 @@ from lang3dxl_ns.scene.photometry import measure_photometry
 def collection(folder):
     parser = PhotoCollectionDataParserConfig(data=folder).setup()
     parser.get_dataparser_outputs("train")
-    return list(parser.photos.values()), parser.reconstruction
+    return parser.capture.photos, parser.capture.reconstruction
 
 
 def verdicts(folder, **settings):

@@ -281,7 +281,10 @@ def test_the_cache_is_read_back_and_forgotten_with_the_geometry(tmp_path, monkey
     expected = painted_scene(cache).find("dome")
     stamp = cache.stat().st_mtime_ns
     with monkeypatch.context() as patched:
-        patched.setattr(Scene, "_fill", lambda *_: pytest.fail("measured again, though it is kept"))
+        patched.setattr(
+            "lang3dxl_ns.query.visibility.filled_pixels",
+            lambda *_: pytest.fail("measured again, though it is kept"),
+        )
         assert painted_scene(cache).find("dome").box == expected.box
     splats = painted_splats()
     painted_scene(cache, splats=replace(splats, means=splats.means + 0.01)).find("dome")

@@ -142,3 +142,26 @@ def test_gaussians_close_to_the_camera_take_four_bytes_a_tile(monkeypatch):
     cloud.render(rasterize, leaves, backend="numba").image.sum().backward()
     assert plans[0].ranks.nbytes <= 4 * 3000 * 20 * 15
     assert bool(leaves["means"].grad.isfinite().all())
+
+
+def test_sums_of_many_threads_are_bounded_by_bytes(monkeypatch):
+    """Of 16 threads only as many keep sums of their own as fit, and the gradients stay the same."""
+    cloud, shapes = make_cloud(2000, 70, 50, size=0.06), []
+    _, expected = rendered(cloud, 1)
+    take = fused_compositing._Kept.take
+
+    def watched(self, shape, dtype):
+        shapes.append(shape)
+        return take(self, shape, dtype)
+
+    monkeypatch.setattr(fused_compositing._Kept, "take", watched)
+    _, found = rendered(cloud, 16)
+    copies, *each = shapes.pop()
+    assert copies == 16
+    for most in (3.5, 0.5):
+        monkeypatch.setattr(fused_compositing, "MOST_SUMS", int(most * 4 * each[0] * each[1]))
+        _, bounded = rendered(cloud, 16)
+        assert shapes.pop()[0] == max(int(most), 1)
+        for name, value in expected.items():
+            torch.testing.assert_close(found[name], value, rtol=1e-4, atol=1e-5)
+            torch.testing.assert_close(bounded[name], value, rtol=1e-4, atol=1e-5)

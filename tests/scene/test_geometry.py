@@ -5,7 +5,7 @@ import torch
 
 from lang3dxl_ns.rendering import Gaussians, rasterize
 from lang3dxl_ns.scene.camera import Camera, Lens, in_view
-from lang3dxl_ns.training.initialization import center_and_radius
+from lang3dxl_ns.training.gaussians import center_and_radius
 
 
 def wide_camera(seed: int) -> Camera:

@@ -6,10 +6,11 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from lang3dxl_ns.preparation.photo_collection import read_transforms
 from PIL import Image, ImageOps
 
+from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.scene.camera import Lens
+from lang3dxl_ns.scene.capture import open_capture
 from lang3dxl_ns.scene.colmap import TrackedPhoto
 from lang3dxl_ns.scene.photo import Photo, stored_size, turned_lens, upright, upright_in_model
 
@@ -79,9 +80,9 @@ def test_a_lying_photo_of_a_transforms_json_is_upright_with_its_camera(tmp_path,
     frame = {"file_path": "a.png", "transform_matrix": pose.tolist()}
     lens = {"w": 60, "h": 40, "fl_x": LENS.fx, "fl_y": LENS.fy, "cx": LENS.cx, "cy": LENS.cy}
     (tmp_path / "transforms.json").write_text(json.dumps({**lens, "frames": [frame]}))
-    photos, left_out, found = read_transforms(tmp_path / "transforms.json")
-    (photo,) = photos.values()
-    assert not left_out and (photo.read_uint8().numpy() == pixels).all()
+    capture = open_capture(tmp_path)
+    (photo,), found = capture.photos, capture.reconstruction
+    assert not capture.left_out and (photo.read_uint8().numpy() == pixels).all()
     plain = turned_lens(replace(LENS, distortion=()), quarters)
     assert photo.lens == plain and found.photos["a.png"].lens == plain
     np.testing.assert_allclose(found.photos["a.png"].camera_from_world, seen.camera_from_world, atol=1e-9)
@@ -123,8 +124,8 @@ def test_an_angle_of_view_along_y_makes_pixels_that_are_not_square(given, fy, tm
     frame = {"file_path": "a.png", "transform_matrix": np.eye(4).tolist()}
     content = {"camera_angle_x": 0.8, **given, "frames": [frame]}
     (tmp_path / "transforms.json").write_text(json.dumps(content))
-    (photo,) = read_transforms(tmp_path / "transforms.json")[0].values()
+    (photo,) = open_capture(tmp_path).photos
     assert photo.lens.fy == pytest.approx(fy * photo.lens.fx)
     (tmp_path / "transforms.json").write_text(json.dumps({**content, "k1": 0.1, "k4": 0.3}))
-    photos, left_out, _ = read_transforms(tmp_path / "transforms.json")
-    assert not photos and "fisheye's k4" in str(left_out)
+    with pytest.raises(UserError, match=r"a\.png has a OPENCV camera with k4, of another model"):
+        open_capture(tmp_path)

@@ -190,17 +190,17 @@ def test_photos_that_do_not_fit_are_named_with_the_reason(photos, capsys):
     Image.fromarray(rng.integers(0, 255, (180, 240, 3), np.uint8)).save(folder / "noise.jpg")
     Image.new("RGB", (240, 180), "gray").save(folder / "blank.jpg")
     (folder / "broken.jpg").write_bytes(b"no photo")
-    (folder / "phone.heic").write_bytes(b"no photo")
+    (folder / "camera.nef").write_bytes(b"no photo")
     shutil.copy(folder / "photo_000.jpg", folder / "twin.jpg")
     report = reconstruct(find_photos(photos), photos / "work", photos / "sparse")
     assert report.registered == 7
     assert report.photos == 12
     reasons = report.left_out
-    assert set(reasons) == {"noise.jpg", "blank.jpg", "broken.jpg", "phone.heic", "twin.jpg"}
+    assert set(reasons) == {"noise.jpg", "blank.jpg", "broken.jpg", "camera.nef", "twin.jpg"}
     assert "matches no other" in reasons["noise.jpg"]
     assert "hardly any detail" in reasons["blank.jpg"]
     assert "damaged" in reasons["broken.jpg"]
-    assert "convert it to JPEG" in reasons["phone.heic"]
+    assert "export it as JPEG" in reasons["camera.nef"]
     assert reasons["twin.jpg"] == "the same file as photo_000.jpg"
     assert any("noise.jpg" in line for line in report.lines())
 

@@ -2,7 +2,7 @@
 
 import torch
 
-from lang3dxl_ns.training.initialization import near_cameras
+from lang3dxl_ns.training.gaussians import near_cameras
 
 
 def test_what_is_near_a_camera_does_not_depend_on_where_the_world_begins():

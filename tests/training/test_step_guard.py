@@ -86,7 +86,7 @@ def test_a_photo_with_a_broken_target_leaves_no_trace_in_the_checkpoint(train, s
     state = torch.load(next(trainer.checkpoint_dir.glob("*.ckpt")), weights_only=True)
     assert all_finite(state["pipeline"])
     assert all_finite(state["optimizers"])
-    assert all_finite(trainer.pipeline.model.strategy_state)
+    assert all_finite(trainer.pipeline.model.run.statistics)
 
 
 def test_a_skipped_step_changes_no_parameter_no_moment_and_no_strategy(train, scene, monkeypatch):
@@ -108,7 +108,7 @@ def test_a_skipped_step_changes_no_parameter_no_moment_and_no_strategy(train, sc
     for name, parameter in trainer.pipeline.model.named_parameters():
         assert torch.equal(parameter, before[name]), name
     assert not any(optimizer.state for optimizer in trainer.optimizers.optimizers.values())
-    assert trainer.pipeline.model.strategy_state["grad2d"] is None
+    assert trainer.pipeline.model.run.statistics["grad2d"] is None
     assert not list(trainer.checkpoint_dir.glob("*.ckpt"))
 
 

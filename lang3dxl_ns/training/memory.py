@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import torch
 
+from lang3dxl_ns.common.kernels import MOST_SUMS
 from lang3dxl_ns.common.memory import machine_memory
-from lang3dxl_ns.plugin.model import Lang3DXLModel
+from lang3dxl_ns.training.state import Training
 
 PER_PARAMETER = 16.0
 """Bytes per parameter for its value, its gradient, and Adam's two moments."""
@@ -27,16 +28,18 @@ MAIN_SHARE = 0.5
 """Share of the main memory to plan with; photos and their targets share this memory."""
 
 
-def bytes_of(model: Lang3DXLModel, pixels: int) -> tuple[float, float]:
+def bytes_of(run: Training, pixels: int) -> tuple[float, float]:
     """Estimate the bytes of training, fixed and per Gaussian, for photos with this number of pixels."""
-    count = model.num_points
-    numbers = sum(p.numel() for p in model.gauss_params.values()) / count
-    others = sum(p.numel() for p in model.parameters()) - numbers * count
-    words = WORDS if model.semantic_field is not None and model.semantic_field.needs_lifting else 0.0
-    codes = model.gauss_params.get("codes") if model.learns_from_renderings else None
+    count, modules = len(run.gaussians["means"]), run.parts.modules().values()
+    numbers = sum(p.numel() for p in run.gaussians.values()) / count
+    others = sum(p.numel() for module in modules for p in module.parameters())
+    words = WORDS if run.learns_words_at_the_end else 0.0
+    codes = run.gaussians["codes"] if run.learns_from_renderings and "codes" in run.gaussians else None
     of_codes = 0.0 if codes is None else PER_CODE * codes.shape[1]
-    fixed = PER_PARAMETER * others + max(PER_PIXEL * pixels, words)
-    looks = 0.0 if model.appearance is None else PER_LOOK
+    # Of two threads, `PER_GAUSSIAN` has the sums.
+    many = run.gaussians["means"].device.type == "cpu" and torch.get_num_threads() > 2
+    fixed = PER_PARAMETER * others + max(PER_PIXEL * pixels, words) + many * MOST_SUMS
+    looks = 0.0 if run.parts.appearance is None else PER_LOOK
     return fixed, PER_PARAMETER * numbers + PER_GAUSSIAN + of_codes + looks
 
 
@@ -50,10 +53,10 @@ def memory_to_plan_with(device: torch.device) -> float:
     return MAIN_SHARE * machine_memory()
 
 
-def plan(model: Lang3DXLModel, pixels: int, device: torch.device, wanted: int | None) -> tuple[int, str]:
+def plan(run: Training, pixels: int, device: torch.device, wanted: int | None) -> tuple[int, str]:
     """Return the cap on Gaussians (0: none) for the setting `max_gaussians`, and a line for the log."""
-    memory, now = memory_to_plan_with(device), model.num_points
-    fixed, each = bytes_of(model, pixels)
+    memory, now = memory_to_plan_with(device), len(run.gaussians["means"])
+    fixed, each = bytes_of(run, pixels)
     most = max(int((memory - fixed) / each), now) if wanted is None else wanted
     limit = f"at most {most:,} Gaussians" if most else "no limit to their number"
     where = "the GPU" if device.type == "cuda" else "training"

@@ -1,4 +1,4 @@
-"""Gaussians of training: the initial ones, one per COLMAP point and a sky; bounds on all of them.
+"""Gaussians of training: their parameters, the initial ones (one per COLMAP point, and a sky), and bounds.
 
 Gaussians that few photos see may grow into sheets across the scene, or float where only new views see them.
 """
@@ -6,18 +6,23 @@ Gaussians that few photos see may grow into sheets across the scene, or float wh
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, MutableMapping
 
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn import Parameter
 
 from lang3dxl_ns.common.device import to_device
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.rendering import harmonics_of
+from lang3dxl_ns.rendering import Gaussians, harmonics_of
+from lang3dxl_ns.rendering.gaussians import MAX_LOG_SCALE
+from lang3dxl_ns.rendering.spherical_harmonics import spherical_harmonics
 
+Parameters = MutableMapping[str, Parameter] | nn.ParameterDict
+"""Parameters of Gaussians by name."""
 FIRST_OPACITY = 0.1
 FEWEST = 4
 """Smallest number of positions, so that each has three neighbors."""
@@ -73,6 +78,28 @@ def initial_gaussians(
     }
 
 
+def activated(g: Mapping[str, Tensor] | nn.ParameterDict) -> Gaussians:
+    """Activate the parameters `g`, which store log scales and logits of opacity, to Gaussians."""
+    scales = g["scales"].clamp_max(MAX_LOG_SCALE).exp()
+    return Gaussians(g["means"], g["quats"], scales, g["opacities"].sigmoid().squeeze(-1))
+
+
+def colors_seen(
+    g: Mapping[str, Tensor] | nn.ParameterDict, degree: int | None, center: Float[Tensor, "3"]
+) -> Float[Tensor, "n 3"]:
+    """Compute the colors of the parameters `g`, seen from a point (world units), by harmonics up to a degree.
+    Without harmonics (None), colors are stored as logits."""
+    if degree is None:
+        return torch.sigmoid(g["features_dc"])
+    directions = g["means"].detach() - center
+    return (spherical_harmonics(degree, directions, harmonics(g)) + 0.5).clamp_min(0.0)
+
+
+def harmonics(g: Mapping[str, Tensor] | nn.ParameterDict) -> Float[Tensor, "n k 3"]:
+    """Return the stored harmonics of the parameters `g`, of all degrees."""
+    return torch.cat((g["features_dc"][:, None], g["features_rest"]), dim=1)
+
+
 def color_parameters(colors: Float[Tensor, "n 3"], degree: int) -> Float[Tensor, "n 3"]:
     """Convert colors (0…1) to stored parameters: harmonics of degree 0, or logits if `degree` is 0."""
     return harmonics_of(colors)[:, 0] if degree > 0 else torch.logit(colors, eps=1e-4)
@@ -103,7 +130,7 @@ def sphere_around(points: Float[Tensor, "n 3"], count: int) -> Float[Tensor, "co
 
 @torch.no_grad()
 def keep_in_bounds(
-    gaussians: torch.nn.ParameterDict, center: Float[Tensor, "3"], radius: float, first: int, degree: int
+    gaussians: nn.ParameterDict, center: Float[Tensor, "3"], radius: float, first: int, degree: int
 ) -> None:
     """Shorten Gaussians that are too long and bring their colors to 0…1, in place. Those before row `first`
     are the sky's, and stay. `center` and `radius` are the scene's, in world units; `degree` is that of the

@@ -1,11 +1,13 @@
 """Memory and time of training: the estimates, and the number of Gaussians that fit."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
 from lang3dxl_ns.common.stages import roughly
-from lang3dxl_ns.plugin import sizes
 from lang3dxl_ns.plugin import trainer as trainers
+from lang3dxl_ns.training import memory as sizes
 
 
 @pytest.fixture
@@ -15,29 +17,36 @@ def model(scene, train):
 
 def cap(model, memory, monkeypatch, pixels=700_000, wanted=None):
     monkeypatch.setattr(sizes, "memory_to_plan_with", lambda device: memory)
-    return sizes.plan(model, pixels, torch.device("cpu"), wanted)[0]
+    return sizes.plan(model.run, pixels, torch.device("cpu"), wanted)[0]
 
 
 @pytest.mark.parametrize("gaussians", [10_000, 3_000_000])
 def test_as_many_gaussians_fit_as_the_memory_was_estimated_for(model, monkeypatch, gaussians):
-    fixed, each = sizes.bytes_of(model, 700_000)
+    fixed, each = sizes.bytes_of(model.run, 700_000)
     assert abs(cap(model, fixed + gaussians * each, monkeypatch) - gaussians) <= 1
 
 
 def test_words_looks_and_pixels_take_memory(model, monkeypatch):
     most = cap(model, 8e9, monkeypatch)
     assert cap(model, 8e9, monkeypatch, pixels=12_000_000) < most
-    model.appearance = model.ssim
+    run = model.run
+    run.parts = replace(run.parts, appearance=model.ssim)
     assert cap(model, 8e9, monkeypatch) < most
-    model.appearance = model.semantic_field = None
+    run.parts = replace(run.parts, appearance=None, semantics=None)
     assert cap(model, 8e9, monkeypatch) > most
+
+
+def test_sums_of_many_threads_are_planned_with(model, monkeypatch):
+    most = cap(model, 8e9, monkeypatch)
+    monkeypatch.setattr(sizes.torch, "get_num_threads", lambda: 64)
+    assert cap(model, 8e9, monkeypatch) < most
 
 
 def test_the_present_gaussians_are_kept_and_a_wish_is_obeyed(model, monkeypatch):
     assert cap(model, 1e6, monkeypatch) == model.num_points  # too little
     assert cap(model, 1e6, monkeypatch, wanted=70) == 70
     monkeypatch.setattr(sizes, "memory_to_plan_with", lambda device: 1e6)
-    most, message = sizes.plan(model, 100, torch.device("cpu"), wanted=0)
+    most, message = sizes.plan(model.run, 100, torch.device("cpu"), wanted=0)
     assert most == 0 and "no limit" in message
 
 

@@ -1,0 +1,124 @@
+"""What people type: one grammar, from a table that the page's JavaScript reads too (`language.json`).
+
+`phrases_of` splits what was typed into prompts and their negatives; `meaning` says what a prompt searches for
+and which of its parts are not used. The table's `cases` are tested in both languages.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+TABLE: dict[str, Any] = json.loads(Path(__file__).with_suffix(".json").read_text(encoding="utf-8"))
+_HELD = "\ue000"
+"""Stands for a separator that is part of a phrase."""
+
+
+@dataclass(frozen=True)
+class Meaning:
+    """What a prompt searches for."""
+
+    target: str
+    """The text that CLIP gets: without lead-ins, articles, places and sizes, in English where the table has
+    the words."""
+    unused: tuple[tuple[str, str], ...] = ()
+    """Parts that the answer does not use, each as its kind, a key of the table's `unused`, and its text."""
+
+    @property
+    def advice(self) -> list[str]:
+        """Sentences about the unused parts."""
+        told = TABLE["unused"]
+        return [
+            told[kind].replace("{target}", self.target).replace("{part}", part) for kind, part in self.unused
+        ]
+
+
+def phrases_of(typed: str) -> list[tuple[str, list[str]]]:
+    """Split what was typed into prompts, each with its negatives. `;`, commas and *and* separate prompts,
+    *not* begins negatives, and quotes protect what they hold. An empty prompt has negatives alone."""
+    held: list[str] = []
+
+    def hold(found: re.Match[str]) -> str:
+        held.append(found[0])
+        return f"{_HELD}{len(held) - 1}{_HELD}"
+
+    text = re.sub(r'"[^"]*"', hold, typed)
+    text = _pattern("one").sub(hold, text)
+    shown = [
+        (_restored(prompt, held), [_restored(phrase, held) for phrase in negatives])
+        for part in text.split(";")
+        for prompt, negatives in _split(part)
+    ]
+    return [(prompt, [n for n in negatives if n]) for prompt, negatives in shown if prompt or any(negatives)]
+
+
+def _split(part: str) -> list[tuple[str, list[str]]]:
+    wanted, *others = _pattern("not").split(part)
+    prompts = _listed(wanted)
+    negatives = [phrase for other in others for phrase in _listed(other)]
+    return [(prompt, negatives) for prompt in prompts or [""]]
+
+
+def _listed(text: str) -> list[str]:
+    parts = (part for piece in text.split(",") for part in _pattern("and").split(piece))
+    return [part for part in parts if part.strip()]
+
+
+def _restored(text: str, held: Sequence[str]) -> str:
+    text = re.sub(f"{_HELD}(\\d+){_HELD}", lambda found: held[int(found[1])], text)
+    return " ".join(text.replace('"', " ").split())
+
+
+@cache
+def _pattern(kind: str) -> re.Pattern[str]:
+    """Match any of the table's phrases of a kind as whole words."""
+    words = "|".join(re.escape(word) for word in sorted(TABLE[kind], key=len, reverse=True))
+    return re.compile(rf"(?<!\w)(?:{words})(?!\w)", re.IGNORECASE)
+
+
+@cache
+def meaning(text: str) -> Meaning:
+    """Find out what a prompt searches for. Names such as *Big Ben*, and texts of nothing but such words,
+    stay as they are."""
+    if re.match(r"(The )?[A-Z]\w* [A-Z]\w*", text) and _english(text) == text:
+        return Meaning(text)
+    unused: list[tuple[str, str]] = []
+    target = re.sub(r"[\s?!.]+$", "", text) or text
+    asks = re.compile(rf"^(?:{_any('lead')}|{_any('count')})\s+(?=\S)", re.IGNORECASE)
+    if (found := asks.match(target)) is not None:
+        if re.fullmatch(rf"(?:{_any('count')})\s+", found[0], re.IGNORECASE):
+            unused.append(("count", found[0].strip()))
+        target = re.sub(r"\s+(?:are|is)(?:\s+there)?$", "", target[found.end() :])
+    if (found := re.match(rf"^(?:{_any('no')})\s+(?=\S)", target, re.IGNORECASE)) is not None:
+        unused.append(("no", found[0].strip()))
+        target = target[found.end() :]
+    article = re.compile(rf"^(?:{_any('articles')})\s+(?=\S)", re.IGNORECASE)
+    target = article.sub("", target)
+    where = re.compile(
+        rf"\s+(?:{_any('before_places')})\s+(?:the\s+)?(?:{_any('places')})(?!\w).*$"
+        rf"|^(?:{_any('places')}|{_any('sizes')})\s+(?!of\b)(?=\S)|\s+(?:{_any('after')})$",
+        re.IGNORECASE,
+    )
+    if parts := [found[0].strip() for found in where.finditer(target)]:
+        unused.append(("place", " ".join(parts)))
+        target = article.sub("", where.sub("", target).strip())
+    target = _english(target.strip() or text)
+    if (found := re.search(rf"(?<!\w)(?:{_any('colors')})(?=\s+\S)", target, re.IGNORECASE)) is not None:
+        unused.append(("color", found[0]))
+    return Meaning(target, tuple(unused))
+
+
+def _any(kind: str) -> str:
+    return _pattern(kind).pattern.removeprefix("(?<!\\w)(?:").removesuffix(")(?!\\w)")
+
+
+def _english(text: str) -> str:
+    """Translate a text of which the table has every word; others stay."""
+    table: dict[str, str] = TABLE["german"]
+    words = text.lower().split()
+    return " ".join(table[word] for word in words) if words and all(word in table for word in words) else text

@@ -1,0 +1,274 @@
+"""A capture prepared for training: photos with foreground, targets, facts, and one photo after the other."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Any, Literal, cast
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from lang3dxl_ns.common.console import say
+from lang3dxl_ns.common.device import to_device
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.memory import machine_memory
+from lang3dxl_ns.preparation.foreground import with_foreground
+from lang3dxl_ns.preparation.model_files import CLIP_OPTION, find_model
+from lang3dxl_ns.preparation.needs import Need, scene_needs
+from lang3dxl_ns.preparation.photo_cache import PhotoCache, has_vanished
+from lang3dxl_ns.preparation.physical_scale import plan_crops
+from lang3dxl_ns.preparation.prepare import prepare
+from lang3dxl_ns.preparation.regions import region_source
+from lang3dxl_ns.preparation.settings import PreparationConfig
+from lang3dxl_ns.preparation.store import FeatureStore, PhotosGoneError
+from lang3dxl_ns.preparation.targets import Batch, SceneFacts, TargetReader
+from lang3dxl_ns.preparation.working_photos import WorkingPhotos
+from lang3dxl_ns.scene.capture import Capture
+from lang3dxl_ns.scene.photo import Photo
+from lang3dxl_ns.scene.record import ScenePhoto, SceneRecord
+from lang3dxl_ns.training.state import PhotoCamera
+
+IN_A_STEP = {"clip_target": torch.float32, "dense_target": torch.float32, "regions": torch.int64}
+"""Number types of targets in a step; in memory they are kept half as wide."""
+MOST_GONE = 0.1
+"""Share of the training photos that may vanish before training ends."""
+ORDER_SEED = 42
+"""Seed of the order of photos."""
+
+
+def read_data(
+    photo: Photo, working: WorkingPhotos, scale: float, targets: TargetReader | None
+) -> dict[str, Any]:
+    """Read a photo's data for a step as they are kept in memory: bytes and half precision. The data are
+    `image` [h, w, 3] uint8, `mask` [h, w, 1] bool if any, and with targets `clip_target` [Hd, Wd, C],
+    `crop_sides` (fractions of the width) and, if any, `dense_target` [t, t, D] and `regions` [h, w]
+    (labels, −1 for none). Raises UserError if something can't be read."""
+    data: dict[str, Any] = {"image": working.read(photo, scale)}
+    if (mask := working.mask(photo, scale)) is not None:
+        data["mask"] = mask[..., None]
+    return data if targets is None else data | read_targets(photo.name, targets)
+
+
+def read_targets(name: str, targets: TargetReader) -> dict[str, Any]:
+    """Read a photo's targets from disk; see `read_data`."""
+    clip = targets.clip(name)
+    found = {"clip_target": clip.features, "dense_target": targets.dense(name)}
+    found["regions"] = targets.regions(name)
+    # Clone the values, so that they are read from disk now and not during the step.
+    data: dict[str, Any] = {key: value.clone() for key, value in found.items() if value is not None}
+    return data | {"crop_sides": clip.crop_fractions}
+
+
+def to_batch(data: dict[str, Any], name: str, index: int, device: torch.device | str) -> Batch:
+    """Put a photo's data on the device, with its name and its number among the training photos."""
+    batch: dict[str, Any] = {"image_idx": index, "name": name}
+    for key, value in data.items():
+        if isinstance(value, Tensor):
+            value = to_device(value, device).to(IN_A_STEP.get(key, value.dtype))
+        batch[key] = value
+    return cast(Batch, batch)
+
+
+@dataclass(eq=False)
+class TrainingData:
+    """A capture's photos for training, in rounds: each round has every photo once, in random order."""
+
+    capture: Capture
+    config: PreparationConfig
+    """Settings of the targets; `dense`, `crops` and `regions` are resolved."""
+    cache_dir: Path
+    """Folder of prepared targets."""
+    device: torch.device | str
+    targets_in_steps: bool
+    """Whether steps learn from the targets."""
+    scale: float = 1.0
+    """Size of the pictures relative to the photos."""
+    cache_gb: float | None = None
+    """Memory for decoded photos, gigabytes; None: a quarter of the machine's."""
+    read_ahead: int = 16
+    """Number of photos read ahead of the training step."""
+    photo_in_hand: str = ""
+    """Name of the latest training photo."""
+    _order: random.Random = field(default_factory=lambda: random.Random(ORDER_SEED))
+    _left_out: set[int] = field(default_factory=set)
+    _gone: int = 0
+
+    def __post_init__(self) -> None:
+        self._upcoming = self._round()
+
+    @cached_property
+    def photos(self) -> dict[str, Photo]:
+        """All photos by name, training photos first, with their foreground masks."""
+        known = {photo.name: photo.at_most(self.config.longer_side) for photo in self.capture.photos}
+        chosen = dict.fromkeys((*self.capture.split.train, *self.capture.split.held_out))
+        photos = [known[name] for name in chosen]
+        folder, config = self.capture.folder, self.config
+        masked = with_foreground(photos, config, folder, self.cache_dir, self.device, say)
+        return {photo.name: photo for photo in masked}
+
+    @property
+    def train(self) -> list[Photo]:
+        """Training photos."""
+        return [self.photos[name] for name in self.capture.split.train]
+
+    @cached_property
+    def cameras(self) -> list[PhotoCamera]:
+        """Cameras of the training photos, at the size of training."""
+        poses = torch.from_numpy(self.capture.poses(self.capture.split.train))
+        lenses = [photo.lens.scaled(self.scale) for photo in self.train]
+        return [
+            PhotoCamera(poses[i], lens.matrix.float(), lens.width, lens.height, i)
+            for i, lens in enumerate(lenses)
+        ]
+
+    @cached_property
+    def needs(self) -> list[Need]:
+        """Needs of the scene for optional parts."""
+        learns, photos = self.config.clip != "none", list(self.photos.values())
+        dense, regions = self.config.makes_dense, self._regions is not None
+        plan, model = self._crops, self.capture.reconstruction
+        return scene_needs(photos, model, plan, learns and dense, learns and regions)
+
+    @cached_property
+    def _crops(self):
+        return plan_crops(list(self.photos.values()), self.capture.reconstruction, self.config)
+
+    @cached_property
+    def _regions(self):
+        return region_source(self.config, self.capture.folder)
+
+    @cached_property
+    def targets(self) -> TargetReader | None:
+        """Targets of all photos, which are made on first use; None if only colors are trained."""
+        if self.config.clip == "none":
+            return None
+        fine = list(self.capture.split.train) if self.config.crops == "fine" else []
+        say(*self._crops.reasons)
+        return prepare(
+            list(self.photos.values()), self._crops.pixel_sizes, self.config, self._crops.scales,
+            FeatureStore(self.cache_dir), self.device, self._regions, fine,
+        )  # fmt: skip
+
+    def facts(self) -> SceneFacts:
+        """Return what a model is built from. Raises UserError if no training photo has targets."""
+        names = list(self.capture.split.train)
+        facts = SceneFacts(names, torch.stack([camera.pose[:, 3] for camera in self.cameras]))
+        facts.needs = {need.component: need.needed for need in self.needs}
+        if self.targets is not None:
+            prepared = set(self.targets.names)  # damaged photos are missing from it
+            usable = [name for name in names if name in prepared]
+            if not usable:
+                raise UserError("none of the training photos can be used: see the reasons above")
+            facts.statistics = self.targets.feature_statistics(usable, self.targets_in_steps)
+            facts.clip_targets = partial(self.targets.clip_features, usable)
+            if self.targets.dense_dim:
+                facts.dense_targets = partial(self.targets.dense_features, usable)
+        return facts
+
+    def record(self, poses: Float[Tensor, "n 3 4"]) -> SceneRecord:
+        """Describe photos, cameras and CLIP for a scene file. `poses`: those of the training photos."""
+        known = None if self.config.clip == "none" else find_model(self.config.clip, CLIP_OPTION)
+        train, held_out = self.capture.split
+        others = [name for name in held_out if name not in train]
+        frame = self.capture.recorded_frame
+        return SceneRecord(
+            photos=[
+                *self._described(train, "train", poses),
+                *self._described(others, "eval", torch.from_numpy(self.capture.poses(others))),
+            ],
+            clip=None if known is None else known.address,
+            clip_identity=None if known is None else known.identity,
+            scale=frame.scale,
+            transform=frame.transform.tolist(),
+            data=str(self.capture.folder),
+        )
+
+    def _described(
+        self, names: Sequence[str], split: Literal["train", "eval"], poses: Tensor
+    ) -> list[ScenePhoto]:
+        named = zip(names, poses.tolist(), strict=True)
+        return [ScenePhoto.of(self.photos[name], split, pose, self.scale) for name, pose in named]
+
+    # ── rounds ──────────────────────────────────────────────────────────────────────────────────────
+
+    @cached_property
+    def _cache(self) -> PhotoCache:
+        targets = self.targets if self.targets_in_steps else None  # prepared now, not in the cache's thread
+        working = WorkingPhotos(FeatureStore(self.cache_dir))
+
+        def read(index: int) -> dict[str, Any]:
+            return read_data(self.train[index], working, self.scale, targets)
+
+        return PhotoCache(read, machine_memory() / 4 if self.cache_gb is None else self.cache_gb * 1e9)
+
+    def _round(self) -> list[int]:
+        order = list(range(len(self.capture.split.train)))
+        self._order.shuffle(order)
+        if not (usable := [i for i in order if i not in self._left_out]):
+            raise UserError("none of the training photos can be used: see the reasons above")
+        return usable
+
+    def next(self) -> tuple[PhotoCamera, Batch]:
+        """Return camera and batch of the next training photo. A photo found to be damaged is left out from
+        then on. Raises PhotosGoneError if too many have vanished."""
+        while True:
+            index = self._upcoming.pop(0)
+            self._upcoming = self._upcoming or self._round()
+            name = self.capture.split.train[index]
+            try:
+                data = self._cache.get(index, self._upcoming[: self.read_ahead])
+            except PhotosGoneError:
+                raise
+            except UserError as reason:
+                say(f"{name} is left out of training: {reason}")
+                self._leave_out(index, reason)
+                self._upcoming = [i for i in self._upcoming if i != index] or self._round()
+                continue
+            self.photo_in_hand = name
+            return self.cameras[index], to_batch(data, name, index, self.device)
+
+    def _leave_out(self, index: int, reason: UserError) -> None:
+        self._left_out.add(index)
+        self._gone += has_vanished(reason)
+        count = len(self.capture.split.train)
+        if self._gone > max(MOST_GONE * count, 1):
+            raise PhotosGoneError(
+                f"{self._gone} of {count} training photos or their targets have vanished; "
+                f"the latest reason: {reason}; restore the disk or network share"
+            ) from reason
+
+    def every_photo(self) -> Iterator[tuple[PhotoCamera, Batch]]:
+        """Yield camera and batch, with targets, of every training photo once, without the damaged ones.
+        Raises UserError if none can be read."""
+        targets, usable = self.targets, False
+        working = WorkingPhotos(FeatureStore(self.cache_dir))
+        for index, photo in enumerate(self.train):
+            if index in self._left_out:
+                continue
+            try:
+                data = read_data(photo, working, self.scale, targets)
+            except PhotosGoneError:
+                raise
+            except UserError as reason:
+                say(f"{photo.name} is left out: {reason}")
+                continue
+            usable = True
+            yield self.cameras[index], to_batch(data, photo.name, index, self.device)
+        if not usable:
+            raise UserError("none of the photos can be used: see the reasons above")
+
+    def state(self) -> dict[str, Any]:
+        """Return the photos left in this round, and the state that determines the next, for a checkpoint."""
+        names = [self.capture.split.train[i] for i in self._upcoming]
+        return {"upcoming": names, "generator": self._order.getstate()}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Restore `state`. Photos that this run lacks are skipped; new ones join in the next round."""
+        index = {name: i for i, name in enumerate(self.capture.split.train)}
+        self._order.setstate(state["generator"])
+        self._upcoming = [index[name] for name in state["upcoming"] if name in index] or self._round()

@@ -1,0 +1,312 @@
+"""Training from start to end: prepare targets, train, learn words, save; a stopped run goes on."""
+
+from __future__ import annotations
+
+import functools
+import signal
+import threading
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import FrameType
+from typing import Any, Literal
+
+import torch
+from torch.optim.lr_scheduler import LambdaLR
+
+from lang3dxl_ns.common.console import say
+from lang3dxl_ns.common.device import best_device
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.files import expanded
+from lang3dxl_ns.common.stages import Stages
+from lang3dxl_ns.files.scene_file import SUFFIX, Provenance, replace_scene
+from lang3dxl_ns.preparation.model_files import check_encoders
+from lang3dxl_ns.preparation.needs import needs_table
+from lang3dxl_ns.preparation.settings import PreparationConfig
+from lang3dxl_ns.query.scene import Scene
+from lang3dxl_ns.scene.capture import Capture, open_capture, say_left_out
+from lang3dxl_ns.scene.photo_folder import check_data
+from lang3dxl_ns.training.batches import TrainingData
+from lang3dxl_ns.training.checkpoint import CHECKPOINT, read_checkpoint, save_checkpoint
+from lang3dxl_ns.training.learn_codes import forget_words, learn_words
+from lang3dxl_ns.training.learning_rates import Rates, learning_rates, printed_learning_rates
+from lang3dxl_ns.training.memory import plan
+from lang3dxl_ns.training.settings import PRINTED_PHOTO_SCALE, TrainingSettings, as_printed
+from lang3dxl_ns.training.snapshot import snapshot
+from lang3dxl_ns.training.state import Training
+from lang3dxl_ns.training.step import finish, losses, render
+from lang3dxl_ns.training.step_guard import StepGuard
+
+Method = Literal["lang3dxl", "lang3dxl-paper"]
+USUAL_STEPS = {"lang3dxl": 30_000, "lang3dxl-paper": 70_000}
+"""Iterations on a GPU, by method."""
+STEPS_ON_A_CPU = 3_000
+"""A step on a CPU takes 0.1 s or more, so the default is a run that ends within minutes."""
+
+
+@dataclass
+class Settings:
+    """Settings of a run."""
+
+    method: Method = "lang3dxl"
+    steps: int = STEPS_ON_A_CPU
+    """Iterations in all."""
+    scene: TrainingSettings = field(default_factory=TrainingSettings)
+    targets: PreparationConfig = field(default_factory=PreparationConfig)
+    rates: Rates = field(default_factory=learning_rates)
+    photo_scale: float = 1.0
+    """Size of the training photos relative to the files'."""
+    seed: int = 42
+    save_every: int = 2_000
+    """Iterations between two checkpoints, at most a quarter of the run."""
+    max_skipped_steps: int = 20
+    """Most steps in a row without a finite loss or gradient before the run stops."""
+
+    @staticmethod
+    def of(method: Method, steps: int | None = None) -> Settings:
+        """Return the usual settings of a method, for its usual number of iterations on this machine unless
+        another is given."""
+        usual = USUAL_STEPS[method] if best_device() == "cuda" else STEPS_ON_A_CPU
+        settings = Settings(method, usual if steps is None else steps)
+        if method == "lang3dxl-paper":
+            as_printed(settings.scene, settings.targets)
+            settings.rates, settings.photo_scale = printed_learning_rates(), PRINTED_PHOTO_SCALE
+        return settings
+
+    def resolve(self) -> None:
+        """Check all settings, and resolve what depends on the length of the run, in place. Raises UserError
+        for a setting that is out of its range."""
+        self.scene.check()
+        self.targets.check()
+        self.scene.fit_to_run(self.steps)
+        for rate, schedule in self.rates.values():
+            rate.fit(self.steps)
+            if schedule is not None:
+                schedule.total_steps = self.steps
+        learned = self.scene.learns_from_renderings
+        self.targets.settle(learned, not learned or self.scene.codes_from == "photos")
+
+
+class Run:
+    """A run in progress: what is trained, its photos and its optimizers."""
+
+    def __init__(self, capture: Capture, settings: Settings, folder: Path, cache_dir: Path, device: str):
+        self.settings, self.folder, self.device = settings, folder, device
+        self.data = TrainingData(
+            capture, settings.targets, cache_dir, device, settings.scene.learns_from_renderings,
+            settings.photo_scale,
+        )  # fmt: skip
+        self.path = folder / f"{capture.folder.name or 'scene'}{SUFFIX}"
+        self.start, self.words_are_learned = 0, False
+        points, colors = map(torch.from_numpy, capture.seeds)
+        facts = self.data.facts()
+        say(needs_table(self.data.needs))
+        torch.manual_seed(settings.seed)
+        # Without points in a transforms.json, which is allowed, training starts from random ones.
+        seeds = (points, colors) if capture.transforms is None or len(points) else None
+        self.state = Training.begin(settings.scene, facts, seeds)
+        self.state.to(device)
+        optimized = self.state.groups()
+        self.optimizers = {name: settings.rates[name][0].adam(group) for name, group in optimized.items()}
+        self.schedulers: dict[str, LambdaLR] = {}
+        for name, optimizer in self.optimizers.items():
+            if (schedule := settings.rates[name][1]) is not None:
+                self.schedulers[name] = schedule.scheduler(optimizer)
+        self.state.optimizers = self.optimizers
+        self.guard = StepGuard(settings.max_skipped_steps, say)
+        pixels = max(camera.width * camera.height for camera in self.data.cameras)
+        most, message = plan(self.state, pixels, torch.device(device), settings.scene.max_gaussians)
+        self.state.densification.most = most
+        say(message)
+        torch.manual_seed(settings.seed)
+
+    @property
+    def about(self) -> dict[str, Any]:
+        """What a checkpoint must agree in to be resumed."""
+        s, frame = self.settings, self.data.capture.recorded_frame
+        photos = [round(v, 3) for v in (*frame.transform.flatten().tolist(), frame.scale)]
+        return {"method": s.method, "clip": s.targets.clip, "steps": s.steps, "photos": photos}
+
+    def iterate(self, step: int) -> None:
+        """Train one iteration."""
+        state, data = self.state, self.data
+        state.step = step
+        if state.codes_begin:
+            if self.settings.scene.codes_from == "photos":
+                self.learn_words()
+            state.codes_have_begun = True
+        for optimizer in self.optimizers.values():
+            optimizer.zero_grad()
+        view, batch = data.next()
+        rendered = render(state, view)
+        found = losses(state, rendered.rgb, rendered.codes, batch)
+        functools.reduce(torch.add, found.values()).backward()
+        groups = {n: [p for g in o.param_groups for p in g["params"]] for n, o in self.optimizers.items()}
+        state.step_is_sound = self.guard.allows(step, data.photo_in_hand, found, groups)
+        for name, optimizer in self.optimizers.items():
+            if not state.step_is_sound:
+                optimizer.zero_grad()
+            elif any(parameter.grad is not None for parameter in groups[name]):
+                optimizer.step()
+        for scheduler in self.schedulers.values():
+            scheduler.step()
+        finish(state)
+
+    def learn_words(self) -> None:
+        """Give the Gaussians codes that represent the photos' targets."""
+        learn_words(self.state, self.data.every_photo(), len(self.data.cameras))
+
+    def save(self, step: int) -> Scene:
+        """Write the checkpoint after an iteration, and the scene so far."""
+        state = {
+            "about": self.about,
+            "step": step,
+            "tensors": self.state.tensors(),
+            "optimizers": {name: o.state_dict() for name, o in self.optimizers.items()},
+            "schedulers": {name: s.state_dict() for name, s in self.schedulers.items()},
+            "run": self.state.progress() | {"photos": self.data.state()},
+            "words": self.words_are_learned,
+        }
+        save_checkpoint(self.folder / CHECKPOINT, state)
+        told = f"{self.settings.method}, {step + 1} of {self.settings.steps} iterations"
+        poses = torch.stack([self.state.pose(view) for view in self.data.cameras]).detach().cpu()
+        scene = snapshot(self.state, self.data.record(poses))
+        return replace_scene(self.path, scene, Provenance(title=self.path.stem, made_how=told))[0]
+
+    def resume(self) -> None:
+        """Go on where the folder's checkpoint ends, if there is one."""
+        saved = read_checkpoint(self.folder / CHECKPOINT, self.about)
+        if saved is None:
+            return
+        self.start, self.words_are_learned = saved["step"] + 1, saved["words"]
+        self.state.load(saved["tensors"])
+        for name, content in saved["optimizers"].items():
+            self.optimizers[name].load_state_dict(content)
+        for name, content in saved["schedulers"].items():
+            self.schedulers[name].load_state_dict(content)
+        self.data.restore(saved["run"]["photos"])
+        self.state.restore(saved["run"])
+        if self.start < self.settings.steps:
+            forget_words(self.state)
+        say(f"Resuming at iteration {self.start} of {self.settings.steps}")
+
+
+def fit(capture: Capture, settings: Settings, out: Path, cache_dir: Path, device: str | None = None) -> Scene:
+    """Train a scene, or go on with the run in a folder.
+
+    Args:
+        capture: photos with cameras and points.
+        settings: settings of the run, which are resolved in place.
+        out: folder of the run; it gets NAME.scene, also at every checkpoint, and the checkpoint.
+        cache_dir: folder of prepared targets.
+        device: by default a GPU if there is one.
+
+    Raises:
+        UserError: the photos or settings cannot be used, or the folder's run is another one.
+        KeyboardInterrupt: Ctrl-C or SIGTERM stopped the run, after a checkpoint.
+    """
+    # A group without gradients so far has a schedule all the same.
+    warnings.filterwarnings("ignore", "Detected call of .lr_scheduler.step")
+    settings.resolve()
+    out.mkdir(parents=True, exist_ok=True)
+    stages = Stages({"prepare": 0.3, "train": 0.6, "words": 0.1})
+    torch.manual_seed(settings.seed)
+    with stages.stage("prepare"):
+        run = Run(capture, settings, out, cache_dir, device or best_device())
+        run.resume()
+    every, last, scene = min(settings.save_every, max(settings.steps // 4, 1)), settings.steps - 1, None
+    with stages.stage("train"), _stoppable() as stop:
+        for step in range(run.start, settings.steps):
+            run.iterate(step)
+            stages.progress((step + 1 - run.start) / (settings.steps - run.start))
+            if stop.is_set() or step == last or (step + 1) % every == 0:
+                scene = run.save(step)
+            if stop.is_set():
+                say(f"Stopped after {step + 1} iterations. To resume: the same command")
+                raise KeyboardInterrupt
+    if run.state.learns_words_at_the_end and not run.words_are_learned:
+        with stages.stage("words"):
+            run.learn_words()
+        run.words_are_learned = True
+        scene = None
+    if summary := run.guard.summary():
+        say(summary)
+    return scene or run.save(last)
+
+
+@contextmanager
+def _stoppable() -> Iterator[threading.Event]:
+    """Yield an event that the first Ctrl-C or SIGTERM sets; a second one acts at once."""
+    stop = threading.Event()
+    if threading.current_thread() is not threading.main_thread():  # only this thread may handle signals
+        yield stop
+        return
+    before = {n: signal.getsignal(n) or signal.SIG_DFL for n in (signal.SIGINT, signal.SIGTERM)}
+
+    def asked(number: int, _frame: FrameType | None) -> None:
+        stop.set()
+        signal.signal(number, before[signal.Signals(number)])
+
+    for number in before:
+        signal.signal(number, asked)
+    try:
+        yield stop
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def run_folder(
+    data: str | Path,
+    out: str | Path | None,
+    settings: Settings,
+    cache_dir: Path | None = None,
+    restart: bool = False,
+) -> tuple[Path, Scene]:
+    """Open the capture in a folder, and train it as `fit`; return the folder of the run, by default
+    outputs/NAME, and the scene. `restart` forgets the folder's run. Raises as `fit`."""
+    check_data(expanded(data))
+    settings.resolve()
+    check_encoders(settings.targets.clip, settings.targets.dense)
+    capture = open_capture(data, cache_dir=cache_dir)
+    say_left_out(capture)
+    folder = Path("outputs") / (capture.folder.name or "scene") if out is None else expanded(out)
+    if restart:
+        (folder / CHECKPOINT).unlink(missing_ok=True)
+    cache = expanded(cache_dir or capture.folder / "lang3dxl_cache")
+    return folder, fit(capture, settings, folder, cache)
+
+
+def train(
+    data: str | Path,
+    out: str | Path | None = None,
+    *,
+    steps: int | None = None,
+    method: Method = "lang3dxl",
+    **settings: Any,
+) -> Scene:
+    """Train a scene from photos, or go on with a run that was stopped, and return it.
+
+    Args:
+        data: folder of photos, with or without a COLMAP model or transforms.json, or a video.
+        out: folder of the run, in which NAME.scene is written; by default outputs/NAME.
+        steps: iterations; by default 30,000 (70,000 as printed) on a GPU and 3,000 without one.
+        method: `lang3dxl`, or `lang3dxl-paper` as printed.
+        **settings: settings of `TrainingSettings`, `PreparationConfig` and `Settings` by name, such as
+            clip="builtin".
+
+    Raises:
+        UserError: the photos or settings cannot be used, or training was interrupted.
+    """
+    chosen = Settings.of(method, steps)
+    for name, value in settings.items():
+        owner = next((o for o in (chosen.scene, chosen.targets, chosen) if hasattr(o, name)), None)
+        if owner is None:
+            raise UserError(f"there is no setting {name}: see lang3dxl train --help-all")
+        setattr(owner, name, value)
+    try:
+        return run_folder(data, out, chosen)[1]
+    except KeyboardInterrupt as error:
+        raise UserError("training was stopped; to resume: the same call") from error

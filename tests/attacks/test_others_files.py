@@ -1,0 +1,200 @@
+"""Files of others: caches and exports don't follow links, nothing of theirs is overwritten or deleted."""
+
+import json
+import os
+import stat
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from painted_scene import CHANNELS, encode_texts, painted_scene
+
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.files import file_locked, locked, replace_file, set_aside
+from lang3dxl_ns.components.decoders import DecoderConfig, make_decoder
+from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
+from lang3dxl_ns.files.scene_file import Provenance, read_scene, replace_scene, write_scene
+from lang3dxl_ns.preparation.store import FeatureStore
+from lang3dxl_ns.scene.record import same_clip
+from lang3dxl_ns.web.write_page import Page, write_page
+from lang3dxl_ns.words.taught_words import TaughtWord, load_words, mask_of, save_words
+
+SETTINGS = {"rule": 1}
+
+
+def stored_scene(**changes):
+    """A scene that a file can hold: the painted one with random weights of the default decoder."""
+    torch.manual_seed(0)
+    decoder = make_decoder(DecoderConfig(name="gathered"), SemanticFieldConfig(preset="short"), CHANNELS, 0)
+    codes = torch.randn(len(painted_scene().splats), 3)
+    return painted_scene(decoder=decoder.requires_grad_(False), codes=codes, **changes)
+
+
+@pytest.fixture
+def word():
+    scene = stored_scene()
+    vector = torch.ones(scene.decoder.clip_dim)
+    return TaughtWord("gizmo", vector, 0.0, 0.0, 0.1, clip=scene.file.clip_identity)
+
+
+@pytest.mark.parametrize("dangling", [False, True])
+def test_our_names_replace_links_and_pipes_and_never_follow_them(tmp_path, dangling):
+    theirs, ours, pipe = tmp_path / "theirs", tmp_path / "ours", tmp_path / "pipe"
+    if not dangling:
+        theirs.write_text("precious")
+    ours.symlink_to(theirs)
+    os.mkfifo(pipe)
+    for path in (ours, pipe):
+        replace_file(path, "cache")
+        assert path.read_text() == "cache" and not path.is_symlink()
+    assert dangling != theirs.exists() and (dangling or theirs.read_text() == "precious")
+
+
+def test_caches_of_a_scene_and_pages_replace_links(tmp_path):
+    precious = tmp_path / "precious"
+    precious.write_text("mine")
+    write_scene(tmp_path / "a.scene", stored_scene())
+    (tmp_path / ".a.visible").symlink_to(precious)
+    assert read_scene(tmp_path / "a.scene", "cpu", encode_texts=encode_texts).visible
+    write_page(Page(painted_scene()), tmp_path / "page")
+    (tmp_path / "page" / "page.css").unlink()
+    (tmp_path / "page" / "page.css").symlink_to(precious)
+    write_page(Page(painted_scene()), tmp_path / "page")
+    assert precious.read_text() == "mine"
+
+
+def test_a_store_enters_no_linked_folder(tmp_path):
+    other, store = FeatureStore(tmp_path / "other"), FeatureStore(tmp_path / "own")
+    other.write("clip", "a.jpg", {"x": torch.ones(3)}, SETTINGS)
+    store.write("clip", "b.jpg", {"x": torch.ones(3)}, SETTINGS)
+    (store.root / "zz").symlink_to(other.root / "clip")
+    assert store.clean([], [])[0] == 1 and "zz" not in store.sizes()
+    assert other.read("clip", "a.jpg")["x"].sum() == 3
+    with pytest.raises(UserError, match="is a link"):
+        store.write("zz", "a.jpg", {"x": torch.ones(3)}, SETTINGS)
+
+
+def test_of_a_shared_store_other_scenes_entries_stay(tmp_path, capsys):
+    store = FeatureStore(tmp_path)
+    for kind in ("clip", "dense"):
+        for name in ("a.jpg", "b.jpg"):
+            store.write(kind, name, {"x": torch.ones(3)}, SETTINGS)
+    assert store.clean(["clip"], ["a.jpg"], shared=True)[0] == 1  # a's dense features
+    assert "2 entries of other photos stay" in capsys.readouterr().out
+    assert store.clean(["clip"], ["a.jpg"])[0] == 2
+
+
+def test_an_altered_entry_is_noticed_also_where_times_are_whole_seconds(tmp_path):
+    store = FeatureStore(tmp_path)
+    store.write("clip", "a.jpg", {"x": torch.ones(64)}, SETTINGS)
+    assert store.is_current("clip", "a.jpg", SETTINGS)
+    path = store.path("clip", "a.jpg")
+    content = bytearray(path.read_bytes())
+    content[-5] ^= 1
+    path.write_bytes(content)
+    os.utime(path, (1_700_000_000, 1_700_000_000))  # as tar, zip and FAT leave them
+    assert not store.is_current("clip", "a.jpg", SETTINGS)
+
+
+def test_modes_stay(tmp_path):
+    path = tmp_path / "a.scene"
+    write_scene(path, stored_scene())
+    path.chmod(0o600)
+    replace_scene(path, stored_scene(), Provenance())
+    assert stat.S_IMODE(path.stat().st_mode) == 0o600
+
+
+@pytest.mark.parametrize("content", [b"no scene at all", b"", "cut", "newer"])
+def test_what_is_no_scene_of_ours_is_kept_beside_the_new_one(tmp_path, content, capsys):
+    path = tmp_path / "a.scene"
+    write_scene(path, stored_scene())
+    whole = path.read_bytes()
+    newer = whole.replace(b'version\\":1', b'version\\":7', 1)
+    assert newer != whole
+    content = {"cut": whole[: len(whole) // 2], "newer": newer}.get(content, content)
+    path.write_bytes(content)
+    for _ in range(2):
+        replace_scene(path, stored_scene(), Provenance())
+    assert (tmp_path / "a.scene.old").read_bytes() == content
+    assert capsys.readouterr().out.count("The file is kept as") == 1
+    assert len(read_scene(path, "cpu").splats) and len(list(tmp_path.glob("*.scene"))) == 1
+    path.write_bytes(b"another")
+    assert set_aside(path).name == "a.scene.old2"
+
+
+def test_a_lock_is_the_files_whichever_link_names_it(tmp_path):
+    (tmp_path / "real").mkdir()
+    (tmp_path / "real" / "a.scene").touch()
+    (tmp_path / "link.scene").symlink_to(tmp_path / "real" / "a.scene")
+    with (
+        file_locked(tmp_path / "link.scene"),
+        pytest.raises(UserError, match="busy"),
+        locked(tmp_path / "real", busy="busy"),
+    ):
+        pass
+
+
+def test_words_are_not_saved_over_another_file(tmp_path, word):
+    for name, content in (
+        ("transforms.json", '{"frames": []}'),
+        ("newer.json", '{"version": 9, "words": []}'),
+    ):
+        (tmp_path / name).write_text(content)
+        with pytest.raises(UserError, match="is another file"):
+            save_words(tmp_path / name, [word])
+        assert (tmp_path / name).read_text() == content
+    save_words(tmp_path / "words.json", [word])
+    save_words(tmp_path / "words.json", [word, replace(word, name="other")])
+    assert len(load_words(tmp_path / "words.json")) == 2
+
+
+@pytest.mark.parametrize(
+    ("size", "counts"),
+    [
+        ([4, 4], [2**63 - 1, 2**63 - 1, 18]),  # their sum is 16 in 64 bits
+        ([4, 4], [-1, 17]),
+        ([4, 4], [0] * 1_000 + [16]),
+        ([1, 179_000_000], [0, 179_000_000]),
+        ([13_416, 13_416], [0, 13_416**2]),
+    ],
+)
+def test_masks_are_bounded_before_they_are_made(tmp_path, word, size, counts):
+    example = {"photo": "a", "points": [], "not_points": [], "mask": {"size": size, "counts": counts}}
+    described = word.to_json() | {"examples": [example]}
+    (tmp_path / "a.json").write_text(json.dumps({"version": 1, "words": [described]}))
+    with pytest.raises(UserError, match="is not a file of taught words"):
+        load_words(tmp_path / "a.json")
+    many = {**example, "mask": {"size": [1024, 1024], "counts": [0, 1 << 20]}}
+    described = word.to_json() | {"examples": [many] * 1_025}
+    (tmp_path / "b.json").write_text(json.dumps({"version": 1, "words": [described]}))
+    with pytest.raises(UserError, match="its masks are too large"):
+        load_words(tmp_path / "b.json")
+    assert np.array_equal(mask_of([1, 2, 1], (2, 2)), [[False, True], [True, False]])
+
+
+@pytest.mark.parametrize(
+    "change", [{"text": -5.0}, {"text": 1e9}, {"doubt": 7.0}, {"doubt": -3.0}, {"clip": "x"}]
+)
+def test_a_word_with_impossible_numbers_or_of_another_clip_is_refused(tmp_path, word, change):
+    scene = stored_scene().with_words([word])
+    write_scene(tmp_path / "a.scene", scene)
+    assert "gizmo" in read_scene(tmp_path / "a.scene", "cpu").words
+    write_scene(tmp_path / "a.scene", stored_scene().with_words([replace(word, **change)]))
+    with pytest.raises(UserError, match="a word"):
+        read_scene(tmp_path / "a.scene", "cpu")
+
+
+def test_a_scene_whose_gaussians_all_have_some_nan_is_refused(tmp_path):
+    scene = stored_scene()
+    means = scene.splats.means.clone()
+    means[:, 0] = torch.nan
+    write_scene(tmp_path / "a.scene", stored_scene(splats=replace(scene.splats, means=means)))
+    with pytest.raises(UserError, match="no Gaussian whose values are all numbers"):
+        read_scene(tmp_path / "a.scene", "cpu")
+
+
+def test_clips_with_another_tokenizer_differ_but_earlier_fingerprints_fit():
+    assert same_clip("aa.bb", "aa.bb") and same_clip("aa", "aa.bb") and same_clip("aa.bb", "aa")
+    assert not same_clip("aa.bb", "aa.cc") and not same_clip("aa", "cc.bb") and same_clip(None, None)
+    assert not same_clip(None, "aa")

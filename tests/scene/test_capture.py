@@ -1,0 +1,533 @@
+"""Captures as other programs leave them: each right value, from formulas."""
+
+import base64
+import json
+import struct
+import zlib
+
+import numpy as np
+import pytest
+from PIL import Image, PngImagePlugin
+from scenes import write_scene
+from scipy.spatial.transform import Rotation
+
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.pictures import mask_values, open_picture
+from lang3dxl_ns.scene.capture import CaptureSettings, open_capture
+from lang3dxl_ns.scene.colmap import read_reconstruction
+from lang3dxl_ns.scene.frame import Frame, find_frame, lost_cameras
+from lang3dxl_ns.scene.names import NameFinder, resolve
+from lang3dxl_ns.scene.photo_folder import find_photos, readable
+from lang3dxl_ns.scene.ply_points import read_ply_points
+from lang3dxl_ns.scene.reconstruct import _numbered
+
+HEIC = (
+    b"c-muNV30{GsVvAy%}izhg51nBLl8SRGck>Uf$?~5YDppk1Sn>t<P<^K3<a6VB@Af5Br_);Y>0~k0}}%yh{gCCLIXhqPz(r|v"
+    b"f&~sKx~njnU@CUfn-I2oK&zfpqh-bWJ3ldK}L`g*NRNAa=wDhl3WI;N=CNKf}#Q-`)OuDaz2nQ1?qKXWCjUM04tLF!0_kqj~"
+    b"@&S{LBeJ9TE<VJdFSUgA_1>R4{{(+%6`EM4+Um6C)#<%mRf*)@iTS&3g7galwHG1_qu6kZ?;9P&Jzi<H6#Coj^N;lk;<m@{)"
+    b"5ZfTFw%Y(OOpBALYnsZifKK(R)0P9n%*3J|w5NPy`7|NlP#g#nPh0Sya*g3O9ckVa+>4h|s2nOT%y0(1_8WM)AwEKV4Kes5%"
+    b"AW^HK$a-=egQq!Oke90-r$>3N3*|8=!B@q-|H5!cTg%y|2-SJgRL-1h0AG`jIyt7|$WC`jt#jf95F7o@-^M>scBA)1RP1v!k"
+    b"@`?O{9ly6dxZRU0<D2rwsr>TZBa5;=%o5IyHEW%>;^3$J_YSkuPRXZk;deN%J%86%>2@*hMvr*sob(+ohgPi@xRf2{E1;}!;"
+    b"vdh~`Yt|@|JWeW=j+R$1>|usFfs~(LKqZ`5N87bqkNeX"
+)
+"""HEIC of 32 × 24 pixels (8 x, 10 y, 60), stored lying: it is turned clockwise by a quarter when shown."""
+
+
+def heic() -> bytes:
+    return zlib.decompress(base64.b85decode(HEIC))
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """Photos photo_000.png … with a binary model."""
+    return write_scene(tmp_path / "scene", photos=6, points=60, image_ext="png")
+
+
+def as_text(folder, images=None, points=None, cameras=None):
+    """Turn the model into text files; functions change the lines of each."""
+    import pycolmap
+
+    model = folder / "sparse" / "0"
+    found = pycolmap.Reconstruction(model)
+    found.write_text(model)
+    for path in model.glob("*.bin"):
+        path.unlink()
+    for name, change in (("images", images), ("points3D", points), ("cameras", cameras)):
+        path = model / f"{name}.txt"
+        if change is not None:
+            path.write_text("\n".join(change(path.read_text().split("\n"))))
+    return model
+
+
+def firsts(lines):
+    """The lines of images.txt that name photos."""
+    return [line for line in lines if line.endswith(".png")]
+
+
+# ── COLMAP's text files ─────────────────────────────────────────────────────────────────────────────────
+
+
+def test_a_text_model_is_the_binary_one(folder):
+    before = read_reconstruction(folder / "sparse" / "0")
+    after = read_reconstruction(as_text(folder))
+    assert list(before.photos) == list(after.photos)
+    for a, b in zip(before.photos.values(), after.photos.values(), strict=True):
+        np.testing.assert_allclose(a.camera_from_world, b.camera_from_world, atol=1e-9)
+        np.testing.assert_allclose(a.points, b.points, atol=1e-9)
+        np.testing.assert_allclose(a.pixels, b.pixels, atol=1e-3)
+        assert a.lens == b.lens
+    assert (before.colors == after.colors).all()
+
+
+def without_second(lines):
+    return firsts(lines)
+
+
+def with_blank_lines(lines):
+    return [part for line in lines for part in (line, "")]
+
+
+def without_comments(lines):
+    return [line for line in lines if not line.startswith("#")]
+
+
+def with_mark(lines):
+    return ["\ufeff" + lines[0], *lines[1:]]
+
+
+def with_windows_ends(lines):
+    return [line + "\r" for line in lines]
+
+
+@pytest.mark.parametrize(
+    "change", [without_second, with_blank_lines, without_comments, with_mark, with_windows_ends]
+)
+def test_images_txt_may_lack_lines_and_have_more(folder, change):
+    tracked = {name: len(p.points) for name, p in read_reconstruction(folder / "sparse" / "0").photos.items()}
+    found = read_reconstruction(as_text(folder, images=change)).photos
+    assert list(found) == list(tracked)
+    expected = dict.fromkeys(tracked, 0) if change is without_second else tracked
+    assert {name: len(photo.points) for name, photo in found.items()} == expected
+
+
+def test_names_have_spaces_and_photos_may_be_numbers(folder):
+    for old, new in (("photo_000.png", "a b  c.png"), ("photo_001.png", "12")):
+        (folder / "images" / old).rename(folder / "images" / new)
+    change = lambda lines: [  # noqa: E731
+        line.replace("photo_000.png", "a b  c.png").replace("photo_001.png", "12") for line in lines
+    ]
+    as_text(folder, images=change)
+    assert {"a b  c.png", "12"} <= set(open_capture(folder).names)
+
+
+def test_photos_may_be_removed_from_images_txt(folder):
+    whole = len(read_reconstruction(folder / "sparse" / "0").points)
+
+    def change(lines):
+        gone = next(i for i, line in enumerate(lines) if line.endswith("photo_002.png"))
+        return lines[:gone] + lines[gone + 2 :]
+
+    found = read_reconstruction(as_text(folder, images=change))
+    assert len(found.photos) == 5 and len(found.points) == whole
+
+
+def test_points_may_lack_colors_and_tracks(folder, capsys):
+    def change(lines):
+        return [" ".join(line.split()[:4]) if line[:1] != "#" else line for line in lines]
+
+    found = read_reconstruction(as_text(folder, points=change))
+    assert (found.colors == 128).all() and len(found.points) > 0
+    assert "no color" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("part", "change", "told"),
+    [
+        ("cameras", lambda ls: [x.replace("PINHOLE", "MAGIC") for x in ls], "camera model MAGIC"),
+        ("cameras", lambda ls: [x.replace(" 96 ", " x ") for x in ls], r"cameras\.txt is not a camera"),
+        ("cameras", lambda ls: [x + " 1" if x[:1] == "1" else x for x in ls], "has 4 parameters, not 5"),
+        ("cameras", lambda ls: ["#"], "camera 1, which the COLMAP model lacks"),
+        ("images", lambda ls: [x.partition(" photo")[0] for x in ls], "keypoints of no photo"),
+        ("images", lambda ls: ls + firsts(ls)[:1], "twice"),
+        ("images", lambda ls: ["1 2 3", *ls], "keypoints of no photo"),
+        ("images", lambda ls: ["1 0 0 0 0 1 2 3 1 photo_000.png"], "no quaternion"),
+        ("images", lambda ls: ["1 1 0 0 0 1,5 2 3 1 photo_000.png"], "neither a photo"),
+        ("points", lambda ls: ["1 2 x 4"], r"points3D\.txt is not a point"),
+    ],
+)
+def test_what_is_wrong_in_a_text_file_is_told_by_name(folder, part, change, told):
+    model = as_text(folder, **{part: change})
+    with pytest.raises(UserError, match=told):
+        read_reconstruction(model)
+
+
+def test_a_binary_model_may_name_removed_photos(folder):
+    """As scripts leave it that remove photos from images.bin alone."""
+    model = folder / "sparse" / "0"
+    whole = (model / "images.bin").read_bytes()
+    last = whole.rindex(b"photo_005.png") - 64
+    (model / "images.bin").write_bytes(struct.pack("<Q", 5) + whole[8:last])
+    assert len(read_reconstruction(model).photos) == 5
+
+
+# ── names ───────────────────────────────────────────────────────────────────────────────────────────────
+
+
+@pytest.mark.parametrize(
+    ("name", "file"),
+    [
+        ("images\\a.png", "a.png"),
+        ("images/a.png", "a.png"),
+        ("C:\\scans\\images\\A.PNG", "a.png"),
+        ("/home/else/images/a.png", "a.png"),
+        ("./../images/a.jpeg", "a.png"),
+        ("a", "a.png"),
+        ("day2/b.jpg", "day2/b.png"),
+        ("caf\u0065\u0301.png", "caf\u00e9.png"),
+    ],
+)
+def test_names_of_other_programs_find_their_file(name, file):
+    files = ["a.png", "day1/b.png", "day2/b.png", "caf\u00e9.png"]
+    assert NameFinder(files).find(name) == [file]
+
+
+def test_ambiguous_and_shared_names_are_refused_and_exact_ones_keep_their_files(capsys):
+    files = ["day1/b.png", "day2/b.png", "c.png", "d.png", "e.png"]
+    names = ["b.png", "x/c.jpg", "y/c.jpg", "d.png", "z/d.png", "E.PNG"]
+    found, refused = resolve(names, files.__contains__, lambda: files, "photos")
+    assert found == {"d.png": "d.png", "E.PNG": "e.png"}
+    assert set(refused) == {"b.png", "x/c.jpg", "y/c.jpg"}
+    assert "1 of 6 photos have other names than listed: E.PNG is e.png" in capsys.readouterr().out
+
+
+def test_a_model_of_jpegs_finds_the_same_photos_as_png(folder):
+    for path in (folder / "images").iterdir():
+        path.rename(path.with_suffix(".PNG"))
+    assert open_capture(folder).names == [f"photo_{i:03d}.PNG" for i in range(6)]
+
+
+# ── masks ───────────────────────────────────────────────────────────────────────────────────────────────
+
+
+@pytest.mark.parametrize("place", ["masks", "mask"])
+@pytest.mark.parametrize(
+    "form", ["{}.png", "{}.jpg", "{}.png.png", "{}_mask.png", "{}.png.mask.png", "{}.mask.png", "mask_{}.png"]
+)
+def test_masks_are_found_by_every_usual_name(folder, place, form):
+    (folder / place).mkdir()
+    for i in range(6):
+        Image.new("L", (96, 72), 255).save(folder / place / form.format(f"photo_{i:03d}"))
+    assert all(photo.mask_path is not None for photo in open_capture(folder).photos)
+
+
+def test_a_mask_with_the_ending_mask_is_found(folder):
+    (folder / "masks").mkdir()
+    Image.new("L", (96, 72), 255).save(folder / "masks" / "photo_000.png.mask", "PNG")
+    assert open_capture(folder).photos[0].mask_path.name == "photo_000.png.mask"
+
+
+def test_masks_that_no_photo_finds_are_told(folder, capsys):
+    (folder / "masks").mkdir()
+    Image.new("L", (96, 72), 255).save(folder / "masks" / "other.png")
+    open_capture(folder)
+    assert "none is named like a photo" in capsys.readouterr().out
+
+
+def palette(colors):
+    image = Image.fromarray(np.array([[0, 0, 1, 1]], np.uint8), "P")
+    image.putpalette([value for color in colors for value in color])
+    return image
+
+
+@pytest.mark.parametrize(
+    "image",
+    [
+        Image.fromarray(np.array([[0, 0, 255, 255]], np.uint8)),
+        Image.fromarray(np.array([[0, 0, 1, 1]], np.uint8)),
+        Image.fromarray(np.array([[0, 0, 1, 1]], np.uint16)),
+        Image.fromarray(np.array([[0, 0, 65535, 65535]], np.uint16)),
+        Image.fromarray(np.array([[0, 0, 1, 1]], bool)),
+        Image.fromarray(np.array([[[0] * 3] * 2 + [[255, 0, 0]] * 2], np.uint8)),
+        palette([(0, 0, 0), (255, 255, 255)]),
+        palette([(0, 0, 0), (1, 1, 1)]),
+        palette([(0, 0, 0), (128, 0, 0)]),
+        palette([(0, 0, 0), (64, 0, 0)]),
+    ],
+)
+def test_masks_of_every_kind_keep_their_right_half(tmp_path, image):
+    image.save(tmp_path / "a.png")
+    with open_picture(tmp_path / "a.png") as stored:
+        assert (np.asarray(mask_values(stored)) >= 128).tolist() == [[False, False, True, True]]
+
+
+def test_a_dark_jpeg_is_no_mask_of_ones(tmp_path):
+    Image.new("L", (8, 8), 1).save(tmp_path / "a.jpg", quality=100)
+    with open_picture(tmp_path / "a.jpg") as stored:
+        assert np.asarray(mask_values(stored)).max() <= 1
+
+
+# ── pictures ────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def test_a_heic_is_upright_everywhere(tmp_path):
+    (tmp_path / "a.HEIC").write_bytes(heic())
+    with open_picture(tmp_path / "a.HEIC") as image:
+        pixels = np.asarray(image.convert("RGB")).astype(int)
+    assert pixels.shape == (32, 24, 3)
+    y, x = np.mgrid[:24, :32]
+    stored = np.stack([8 * x, 10 * y, np.full_like(x, 60)], axis=-1)
+    assert np.abs(np.rot90(stored, -1) - pixels).mean() < 6
+    assert readable(find_photos(tmp_path))[0].names == ("a.HEIC",)
+
+
+def test_colmap_gets_a_jpeg_of_a_heic_and_the_right_ending_of_others(tmp_path):
+    (tmp_path / "a.heic").write_bytes(heic())
+    Image.new("RGB", (8, 6)).save(tmp_path / "b.jfif", "JPEG")
+    Image.new("RGB", (8, 6)).save(tmp_path / "c.jpe", "PNG")
+    copies = _numbered(find_photos(tmp_path), tmp_path / "work")
+    assert copies.names == ("000000.jpg", "000001.jpg", "000002.png")
+    with Image.open(copies.folder / "000000.jpg") as image:
+        assert image.size == (24, 32)
+
+
+@pytest.mark.parametrize("compression", ["raw", "tiff_lzw"])
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_a_tiff_is_read_as_stored(tmp_path, orientation, compression):
+    pixels = np.random.default_rng(0).integers(0, 256, (6, 10, 3), dtype=np.uint8)
+    exif = Image.Exif()
+    exif[0x112] = orientation
+    Image.fromarray(pixels).save(tmp_path / "a.tif", exif=exif, compression=compression)
+    with open_picture(tmp_path / "a.tif") as image:
+        assert image.size == (10, 6) and image.getexif().get(0x112) == orientation
+        assert (np.asarray(image.convert("RGB")) == pixels).all()
+
+
+def test_a_png_with_megabytes_of_text_is_read(tmp_path):
+    pixels = np.random.default_rng(0).integers(0, 256, (6, 10, 3), dtype=np.uint8)
+    text = PngImagePlugin.PngInfo()
+    text.add_itxt("XML:com.adobe.xmp", "x" * 3_000_000, zip=True)
+    Image.fromarray(pixels).save(tmp_path / "a.png", pnginfo=text)
+    with open_picture(tmp_path / "a.png") as image:
+        assert (np.asarray(image.convert("RGB")) == pixels).all()
+
+
+@pytest.mark.parametrize("name", ["a.dng", "a.NEF", "a.cr3", "a.psd", "a.jp2"])
+def test_pictures_that_are_never_read_are_named_with_the_way_out(tmp_path, name):
+    Image.new("RGB", (8, 6)).save(tmp_path / name, "TIFF")  # as raw files begin: Pillow reads a thumbnail
+    _, bad = readable(find_photos(tmp_path))
+    assert "JPEG" in bad[name]
+
+
+# ── points ──────────────────────────────────────────────────────────────────────────────────────────────
+
+
+def ply(path, form, kinds, rows, colors=("red", "green", "blue")):
+    names = ["x", "y", "z", *colors][: len(rows[0])]
+    words = {"f4": "float", "f8": "double", "u1": "uchar", "u2": "ushort"}
+    head = f"ply\nformat {form} 1.0\nelement vertex {len(rows)}\n"
+    head += "".join(f"property {words[k]} {n}\n" for k, n in zip(kinds, names, strict=True)) + "end_header\n"
+    order = ">" if "big" in form else "<"
+    table = np.array([tuple(r) for r in rows], [(n, order + k) for n, k in zip(names, kinds, strict=True)])
+    body = "\n".join(" ".join(map(str, r)) for r in rows).encode() if form == "ascii" else table.tobytes()
+    path.write_bytes(head.encode() + body)
+    return path
+
+
+@pytest.mark.parametrize("form", ["ascii", "binary_little_endian", "binary_big_endian"])
+@pytest.mark.parametrize(("kind", "full"), [("u1", 255), ("u2", 65535), ("f4", 1.0), ("f4", 255.0)])
+def test_points_of_every_form_have_their_colors(tmp_path, form, kind, full):
+    rows = [(1.5, 2, 3, full, 0, full), (4, 5, 6, 0, full, 0)]
+    points, colors = read_ply_points(ply(tmp_path / "a.ply", form, ["f8"] * 3 + [kind] * 3, rows))
+    assert points.tolist() == [[1.5, 2, 3], [4, 5, 6]]
+    assert colors.tolist() == [[255, 0, 255], [0, 255, 0]]
+
+
+def test_points_without_colors_are_gray(tmp_path, capsys):
+    _, colors = read_ply_points(ply(tmp_path / "a.ply", "ascii", ["f4"] * 3, [(1.0, 2, 3)]))
+    assert colors.tolist() == [[128, 128, 128]] and "no colors" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("content", [b"", b"ply\n", b"ply\nformat ascii 1.0\nend_header\n"])
+def test_damaged_points_are_named(tmp_path, content):
+    (tmp_path / "a.ply").write_bytes(content)
+    with pytest.raises(UserError, match=r"the points of .*a\.ply can't be read"):
+        read_ply_points(tmp_path / "a.ply")
+
+
+# ── transforms.json ─────────────────────────────────────────────────────────────────────────────────────
+
+
+def write_transforms(folder, names=None, scale=1.0, **top):
+    model = read_reconstruction(folder / "sparse" / "0")
+    frames = []
+    for name, photo in model.photos.items():
+        pose = np.linalg.inv(np.vstack([photo.camera_from_world, [0, 0, 0, 1]]))
+        pose[:3, 1:3] *= -1
+        pose[:3, :3] *= scale
+        frames.append({"file_path": f"images/{name}", "transform_matrix": pose.tolist()})
+    lens = next(iter(model.photos.values())).lens
+    content = {"w": 96, "h": 72, "fl_x": lens.fx, "fl_y": lens.fy, "cx": lens.cx, "cy": lens.cy}
+    for frame, name in zip(frames, names or (), strict=False):
+        frame["file_path"] = name
+    (folder / "transforms.json").write_text(json.dumps(content | top | {"frames": frames}))
+    return model
+
+
+def test_transforms_and_model_are_one_capture(folder):
+    model = open_capture(folder)
+    points = [(*p, *c) for p, c in zip(model.reconstruction.points, model.reconstruction.colors, strict=True)]
+    ply(folder / "points.ply", "binary_little_endian", ["f8"] * 3 + ["u1"] * 3, points)
+    write_transforms(folder, ply_file_path="points.ply", scale=1.5)
+    found = open_capture(folder / "transforms.json")
+    for a, b in zip(model.reconstruction.photos.values(), found.reconstruction.photos.values(), strict=True):
+        np.testing.assert_allclose(a.camera_from_world, b.camera_from_world, atol=1e-9)
+        assert a.lens == b.lens
+    np.testing.assert_allclose(model.reconstruction.points, found.reconstruction.points)
+    assert (model.reconstruction.colors == found.reconstruction.colors).all()
+    assert [p.name for p in found.photos] == [f"images/{p.name}" for p in model.photos]
+
+
+@pytest.mark.parametrize(
+    ("top", "distortion", "fisheye"),
+    [
+        ({"camera_model": "SIMPLE_RADIAL", "k1": 0.01}, (0.01, 0, 0, 0), False),
+        ({"camera_model": "RADIAL", "k1": 0.01, "k2": 0.02}, (0.01, 0.02, 0, 0), False),
+        ({"camera_model": "opencv", "k1": 0.01, "p2": 0.03, "k3": 0.2}, (0.01, 0, 0, 0.03, 0.2), False),
+        ({"camera_model": "PINHOLE"}, (), False),
+        ({"camera_model": "FULL_OPENCV", "k6": 0.1}, (0, 0, 0, 0, 0, 0, 0, 0.1), False),
+        ({"camera_model": "OPENCV_FISHEYE", "k4": 0.1}, (0, 0, 0, 0.1), True),
+        ({"is_fisheye": True, "k2": 0.1}, (0, 0.1, 0, 0), True),
+        ({"distortion_params": [0.1, 0.2, 0.3, 0, 0.01, 0.02]}, (0.1, 0.2, 0.01, 0.02, 0.3), False),
+    ],
+)
+def test_every_camera_model_has_its_coefficients(folder, top, distortion, fisheye):
+    write_transforms(folder, **top)
+    lens = open_capture(folder / "transforms.json").photos[0].lens
+    assert (lens.distortion, lens.fisheye) == (distortion, fisheye)
+
+
+def test_lists_of_photos_split_them(folder):
+    names = [f"images/photo_{i:03d}.png" for i in range(6)]
+    write_transforms(folder, train_filenames=names[:3], val_filenames=names[4:5], test_filenames=names[5:])
+    assert open_capture(folder / "transforms.json").split == (tuple(names[:3]), tuple(names[4:]))
+
+
+@pytest.mark.parametrize("missing", ["sparse_pc.ply", "points/a.ply"])
+def test_points_that_are_not_there_are_told(folder, missing, capsys):
+    write_transforms(folder, ply_file_path=missing)
+    assert not len(open_capture(folder / "transforms.json").reconstruction.points)
+    assert "random" in capsys.readouterr().out
+
+
+# ── split and frame ─────────────────────────────────────────────────────────────────────────────────────
+
+
+def random_poses(count, seed=0):
+    rng = np.random.default_rng(seed)
+    turns = Rotation.random(count, random_state=seed).as_matrix()
+    return np.concatenate([turns, rng.normal(size=(count, 3, 1))], axis=2)
+
+
+def ring(count=9):
+    """Cameras around a place, which look at it, some from above (camera → world; y up, z backward)."""
+    angles = np.arange(count) * 2 * np.pi / count
+    places = np.column_stack([4 * np.cos(angles), 3 * np.sin(angles), 0.3 * np.arange(count)])
+    back = places / np.linalg.norm(places, axis=1, keepdims=True)
+    right = np.cross([0.1, 0, 1.0], back)
+    right /= np.linalg.norm(right, axis=1, keepdims=True)
+    tilted = Rotation.from_rotvec([0.4, 0.2, 0]).as_matrix()
+    return tilted @ np.stack([right, np.cross(back, right), back, places + np.array([1.0, 2, 0])], axis=2)
+
+
+@pytest.mark.parametrize("orientation", ["up", "vertical", "none"])
+@pytest.mark.parametrize("center", ["poses", "focus", "none"])
+def test_the_frame_is_nerfstudios(orientation, center):
+    import torch
+    from nerfstudio.cameras.camera_utils import auto_orient_and_center_poses
+
+    poses = ring()
+    whole = torch.from_numpy(np.concatenate([poses, np.tile([[[0, 0, 0, 1.0]]], (9, 1, 1))], axis=1)).float()
+    theirs, _ = auto_orient_and_center_poses(whole, orientation, center)
+    scale = 1 / float(theirs[:, :3, 3].abs().max())
+    theirs[:, :3, 3] *= scale
+    frame = find_frame(poses, np.zeros((0, 3)), np.eye(3), orientation, center)
+    assert frame.scale == pytest.approx(scale, rel=1e-4)
+    np.testing.assert_allclose(frame.poses(poses), theirs.numpy(), atol=1e-4)
+
+
+def test_principal_axes_become_the_frames_with_the_smallest_variance_along_z():
+    poses = find_frame(ring(), np.zeros((0, 3)), np.eye(3), "pca").poses(ring())
+    spread = np.cov(poses[:, :, 3], rowvar=False)
+    assert spread[0, 0] > spread[1, 1] > spread[2, 2]
+    np.testing.assert_allclose(spread - np.diag(np.diag(spread)), 0, atol=1e-9)
+    assert poses[:, 2, 1].mean() > 0 and np.linalg.det(poses[0, :, :3]) == pytest.approx(1)
+
+
+def test_a_frame_on_a_map_is_exact_to_a_micrometer():
+    poses, far = random_poses(9), np.array([4.5e5, 5.3e6, 120.0])
+    moved = poses.copy()
+    moved[:, :, 3] += far
+    near, away = (find_frame(p, np.zeros((0, 3)), np.eye(3)) for p in (poses, moved))
+    np.testing.assert_allclose(near.poses(poses), away.poses(moved), atol=1e-8)
+    back = (away.points(moved[:, :, 3]) / away.scale - away.transform[:, 3]) @ away.transform[:, :3]
+    np.testing.assert_allclose(back, moved[:, :, 3], atol=1e-6)
+
+
+def test_a_frame_after_another_is_both():
+    frame = Frame(random_poses(1)[0], 0.7)
+    first, points = Frame(random_poses(1, 1)[0], 3.0), np.random.default_rng(2).normal(size=(5, 3))
+    applied = 3.0 * (points @ first.transform[:, :3].T) + first.transform[:, 3]
+    given = np.column_stack([first.transform[:, :3], first.transform[:, 3] / 3.0])
+    np.testing.assert_allclose(frame.after(given, 3.0).points(points), frame.points(applied))
+
+
+@pytest.mark.parametrize("times", [500, 20_000, 1e6])
+@pytest.mark.parametrize("lost", [1, 2])
+def test_lost_cameras_are_told_and_change_nothing(times, lost):
+    poses = random_poses(10)
+    centers = poses[:, :, 3].copy()
+    centers[:lost] = [times, -times, 0]
+    assert lost_cameras(centers, np.zeros((0, 3))).tolist() == [True] * lost + [False] * (10 - lost)
+
+
+@pytest.mark.parametrize("times", [1, 10, 50])
+def test_far_cameras_are_not_lost(times):
+    centers = random_poses(10)[:, :, 3]
+    centers[0] *= times
+    assert not lost_cameras(centers, np.zeros((0, 3))).any()
+    still = np.zeros((10, 3))
+    still[:4] = random_poses(4)[:, :, 3]
+    assert not lost_cameras(still, np.zeros((0, 3))).any()
+
+
+def test_a_capture_without_its_lost_photo_is_the_others_alone(folder, capsys):
+    import pycolmap
+
+    model = pycolmap.Reconstruction(folder / "sparse" / "0")
+    lost = next(image for image in model.images.values() if image.name == "photo_003.png")
+    turn = lost.cam_from_world().rotation
+    model.frames[lost.frame_id].rig_from_world = pycolmap.Rigid3d(turn, np.array([0, 0, 20_000.0]))
+    model.write_binary(folder / "sparse" / "0")
+    found = open_capture(folder)
+    assert "pose is wrong" in found.left_out["photo_003.png"] and len(found.photos) == 5
+    assert np.abs(found.poses(found.names)[:, :, 3]).max() == pytest.approx(1, abs=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("settings", "held_out"),
+    [
+        ({}, [0]),
+        ({"eval_interval": 2}, [0, 2, 4]),
+        ({"eval_mode": "fraction", "train_split_fraction": 0.5}, [1, 3, 4]),
+        ({"eval_mode": "all"}, [0, 1, 2, 3, 4, 5]),
+    ],
+)
+def test_the_split_follows_the_rule(folder, settings, held_out):
+    split = open_capture(folder, CaptureSettings(**settings)).split
+    assert split.held_out == tuple(f"photo_{i:03d}.png" for i in held_out)
+
+
+def test_lists_of_a_folder_split_its_photos(folder):
+    (folder / "train_list.txt").write_text("photo_001.png\nphoto_002.png\n")
+    (folder / "test_list.txt").write_text("photo_003.png\n")
+    assert open_capture(folder).split == (("photo_001.png", "photo_002.png"), ("photo_003.png",))

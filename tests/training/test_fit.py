@@ -1,0 +1,99 @@
+"""`fit`: the same bytes as `ns-train`, also after a stop; what a run leaves in its folder."""
+
+import os
+import signal
+from pathlib import Path
+
+import pytest
+import torch
+from scenes import write_scene
+
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.files.scene_file import read_scene
+from lang3dxl_ns.scene.capture import open_capture
+from lang3dxl_ns.training import fit as fitting
+from lang3dxl_ns.training.checkpoint import CHECKPOINT
+from lang3dxl_ns.training.fit import Run, Settings, fit
+
+STEPS = 20
+GROWING = {"densify_grad_thresh": 1e-7, "densify_every": 0.2, "densify_until": 0.75}
+"""Gaussians double several times, with random splits."""
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory) -> Path:
+    return write_scene(tmp_path_factory.mktemp("data") / "scene", photos=6, points=100)
+
+
+@pytest.fixture
+def settings(tiny_clip, tiny_dense):
+    def make(steps: int = STEPS, **changes) -> Settings:
+        made = Settings.of("lang3dxl", steps)
+        made.targets.clip, made.targets.dense = str(tiny_clip), str(tiny_dense)
+        made.scene.sky_gaussians, made.scene.semantic_field.code_dim = 400, 3
+        made.scene.decoder.compression.steps, made.scene.decoder.compression.batch = 20, 512
+        for name, value in (GROWING | changes).items():
+            assert hasattr(made.scene, name)
+            setattr(made.scene, name, value)
+        return made
+
+    return make
+
+
+def trained(data: Path, out: Path, settings: Settings) -> dict:
+    fit(open_capture(data), settings, out, data / "lang3dxl_cache", "cpu")
+    return torch.load(out / CHECKPOINT, weights_only=True)["tensors"]
+
+
+def differing(first: dict, second: dict) -> list[str]:
+    assert first.keys() == second.keys()
+    return [
+        name
+        for name, value in first.items()
+        if isinstance(value, torch.Tensor)
+        and not (
+            value.shape == second[name].shape and torch.equal(value.nan_to_num(), second[name].nan_to_num())
+        )
+    ]
+
+
+def test_nerfstudio_trains_the_same_bytes(data, settings, train, tmp_path):
+    mine = trained(data, tmp_path / "mine", settings())
+    changes = {f"pipeline__model__{name}": value for name, value in GROWING.items()}
+    theirs = train(data, STEPS, steps_per_eval_image=0, **changes).pipeline.model.state_dict()
+    theirs.pop("device_indicator_param")
+    assert len(mine["gauss_params.means"]) > 600 and "gauss_params.codes" in mine
+    assert differing(mine, dict(theirs)) == []
+
+
+def test_a_run_that_was_stopped_ends_with_the_same_bytes(data, settings, tmp_path, monkeypatch):
+    """By Ctrl-C within an iteration, and by being killed between two checkpoints."""
+    whole = trained(data, tmp_path / "whole", settings())
+    iterate = Run.iterate
+
+    def interrupted(self, step):
+        iterate(self, step)
+        if step == 7:
+            os.kill(os.getpid(), signal.SIGINT)
+        if step == 13:
+            raise SystemError
+
+    monkeypatch.setattr(Run, "iterate", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        trained(data, tmp_path / "again", settings())
+    assert read_scene(tmp_path / "again" / "scene.scene").splats is not None  # the state so far
+    with pytest.raises(SystemError):
+        trained(data, tmp_path / "again", settings())
+    monkeypatch.setattr(Run, "iterate", iterate)
+    assert differing(whole, trained(data, tmp_path / "again", settings())) == []
+
+
+def test_a_finished_run_is_not_trained_again_and_another_one_is_refused(
+    data, settings, tmp_path, monkeypatch
+):
+    trained(data, tmp_path, settings(4))
+    monkeypatch.setattr(fitting, "render", lambda *_: pytest.fail("trained again"))
+    monkeypatch.setattr(fitting, "learn_words", lambda *_: pytest.fail("learned again"))
+    trained(data, tmp_path, settings(4))
+    with pytest.raises(UserError, match="holds a run with another steps"):
+        trained(data, tmp_path, settings(5))
