@@ -24,7 +24,6 @@ from lang3dxl_ns.scene.camera import Camera
 from lang3dxl_ns.scene.record import overview
 
 if TYPE_CHECKING:
-    from nerfstudio.engine.trainer import Trainer
     from nerfstudio.viewer.viewer import Viewer
 
 INVITATION = (
