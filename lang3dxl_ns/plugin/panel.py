@@ -211,9 +211,10 @@ def stand_of(
 
 
 class _Trains(Protocol):
-    """What tells whether a trainer still changes its model."""
+    """Trainer that tells whether it still changes its model."""
 
-    training_state: str
+    @property
+    def training_state(self) -> str: ...
 
 
 def _changes(trainer: _Trains | None) -> bool:
