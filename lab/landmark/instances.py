@@ -1,4 +1,4 @@
-"""True things of a landmark, such as its windows, portals and towers, and the photos that show each."""
+"""True things of a landmark: every window, portal, dome, tower, spire, minaret, and which photos show it."""
 
 from __future__ import annotations
 

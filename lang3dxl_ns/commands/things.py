@@ -22,8 +22,9 @@ from lang3dxl_ns.things.write import write_catalog, write_picture, write_things
 @showing("scene", "text", "ask", "out", "splats", "view")
 @dataclass(kw_only=True)
 class ListThings:
-    """List the single things that words name: windows, portals, towers. Write things.json (boxes, scores, photos,
-    what is in what), things.csv, instances.json (COCO boxes in all photos) and things.png (numbered boxes)."""
+    """List the single things that words name: windows, portals, towers. --out gets things.json (boxes,
+    scores, photos, what is in what), things.csv, instances.json (COCO boxes in all photos) and things.png
+    (numbered boxes)."""
 
     scene: tyro.conf.Positional[Path | None] = None
     """A .scene file, a folder that holds one, or a run (default: the newest run under outputs/)."""

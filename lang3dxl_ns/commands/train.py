@@ -12,7 +12,7 @@ import tyro
 from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.settings_help import showing, without
 from lang3dxl_ns.preparation.settings import PreparationConfig
-from lang3dxl_ns.training.settings import TrainingSettings
+from lang3dxl_ns.training.settings import SceneSettings
 
 
 @showing(
@@ -20,11 +20,9 @@ from lang3dxl_ns.training.settings import TrainingSettings
     *("foreground", "workers", "cache_dir", "photo_scale", "sky_gaussians", "max_gaussians"),
     *("view_dependence", "camera_optimization"),
 )
-@without(
-    *("decoder", "semantic_field", "downsampler", "appearance", "camera_optimizer", "total_steps"),
-)
+@without("total_steps")
 @dataclass(kw_only=True)
-class Train(TrainingSettings, PreparationConfig):
+class Train(SceneSettings, PreparationConfig):
     """Train a scene from photos: Gaussians with colors, and words for them.
 
     Photos without a COLMAP model or a transforms.json are reconstructed first. A run that was stopped, by
@@ -59,7 +57,7 @@ class Train(TrainingSettings, PreparationConfig):
 
         option_prefix.set("--")
         settings = Settings.of(self.method, self.steps)
-        for owner, kind in ((settings.scene, TrainingSettings), (settings.targets, PreparationConfig)):
+        for owner, kind in ((settings.scene, SceneSettings), (settings.targets, PreparationConfig)):
             for name, value in _changed(self, kind).items():
                 setattr(owner, name, value)
         settings.save_every, settings.seed = self.save_every, self.seed

@@ -20,7 +20,6 @@ from lang3dxl_ns.query.scene import Scene, text_encoder
 from lang3dxl_ns.query.text import EncodeTexts, caution
 from lang3dxl_ns.rendering import Rendering
 from lang3dxl_ns.scene.record import SceneRecord
-from lang3dxl_ns.training.learn_codes import forget_words
 
 _LONGEST = 40
 """Most characters of a prompt in the summary."""
@@ -122,7 +121,7 @@ class Conversation:
                 return scene, step if learning else None
             finally:
                 if learning:
-                    forget_words(self.model.run)
+                    self.model.forget_gathered_codes()
                 self.model.train(training)
 
     # ── answering: called by the render thread, which holds the lock ────────────────────────────────

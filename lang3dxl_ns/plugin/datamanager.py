@@ -54,7 +54,7 @@ from lang3dxl_ns.scene.colmap import Reconstruction
 from lang3dxl_ns.scene.frame import Frame
 from lang3dxl_ns.scene.photo import Photo
 from lang3dxl_ns.scene.record import SCENE_FILE, ScenePhoto, SceneRecord
-from lang3dxl_ns.training.batches import MOST_GONE, read_targets, to_batch
+from lang3dxl_ns.training.batches import MOST_GONE, read_targets, settle, to_batch
 
 
 @without(*OF_IMAGE_CACHES)
@@ -90,9 +90,9 @@ class Lang3DXLDataManagerConfig(PreparationConfig, FullImageDatamanagerConfig):
         check_numbers(self.dataparser, {n: b for n, b in _OF_PARSER.items() if hasattr(self.dataparser, n)})
 
     def settle_targets(self, learned: bool, gathered: bool) -> None:
-        """Resolve what is prepared as `settle`, and whether steps read targets."""
+        """Resolve what is prepared as `batches.settle`, and whether steps read targets."""
         self.targets_in_steps = learned
-        self.settle(learned, gathered)
+        settle(self, learned, gathered)
 
 
 _BOUNDS = {"camera_res_scale_factor": (0.001, 8), "cache_gb": (0, 1e6), "read_ahead": (0, 1000)}

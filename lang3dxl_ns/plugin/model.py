@@ -24,7 +24,7 @@ from lang3dxl_ns.plugin.model_config import ModelSettings
 from lang3dxl_ns.plugin.rendering_model import RenderingModel
 from lang3dxl_ns.plugin.splatfacto import SplatfactoModel
 from lang3dxl_ns.preparation.targets import Batch, foreground
-from lang3dxl_ns.training.learn_codes import learn_words
+from lang3dxl_ns.training.learn_codes import forget_words, learn_words
 from lang3dxl_ns.training.state import Training
 from lang3dxl_ns.training.step import finish, losses
 
@@ -62,6 +62,10 @@ class Lang3DXLModel(RenderingModel):
         """Give the Gaussians codes that represent the targets of this number of photos (cameras and batches);
         see `learn_codes`."""
         learn_words(self.run, ((photo_camera(camera), batch) for camera, batch in photos), count)
+
+    def forget_gathered_codes(self) -> None:
+        """Remove codes that were gathered for a question in training, since the Gaussians still change."""
+        forget_words(self.run)
 
     def get_param_groups(self) -> dict[str, list[Parameter]]:
         """Return the optimizer groups: one per Gaussian property, and those of the parts."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from contextlib import nullcontext
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 import viser
@@ -24,7 +24,6 @@ from lang3dxl_ns.scene.camera import Camera
 from lang3dxl_ns.scene.record import overview
 
 if TYPE_CHECKING:
-    from nerfstudio.engine.trainer import Trainer
     from nerfstudio.viewer.viewer import Viewer
 
 INVITATION = (
@@ -211,7 +210,14 @@ def stand_of(
     return position, position + max(ahead, 0.05) * forward, fov
 
 
-def _changes(trainer: Trainer | None) -> bool:
+class _Trains(Protocol):
+    """Trainer that tells whether it still changes its model."""
+
+    @property
+    def training_state(self) -> str: ...
+
+
+def _changes(trainer: _Trains | None) -> bool:
     """Return whether training still changes its model; None: there is no training."""
     if trainer is None or trainer.training_state == "completed":
         return False

@@ -116,19 +116,6 @@ class PreparationConfig:
     """SAM for regions and for boxes: a name or a folder. The authors use facebook/sam-vit-huge, which is
     several times as slow; label maps are too small to show much difference."""
 
-    def settle(self, learned: bool, gathered: bool) -> None:
-        """Resolve what is prepared: semantics `learned` with the scene use regions in every step; features
-        `gathered` onto Gaussians, also those that codes start from, need fine crops."""
-        from lang3dxl_ns.preparation.encoders import usual_dense
-        from lang3dxl_ns.preparation.model_files import usual_clip
-
-        self.clip = usual_clip(self.clip)
-        if self.crops == "auto":
-            self.crops = "fine" if gathered else "pyramid"
-        if not learned or self.clip == "none":
-            self.regions = "none"
-        self.dense = "none" if self.clip == "none" else usual_dense(self, learned)
-
     def check(self) -> None:
         """Raise UserError for invalid options, before any work."""
         check_numbers(self, _BOUNDS, "--pipeline.datamanager.")

@@ -61,6 +61,8 @@ def _split(part: str) -> list[tuple[str, list[str]]]:
     wanted, *others = _pattern("not").split(part)
     prompts = _listed(wanted)
     negatives = [phrase for other in others for phrase in _listed(other)]
+    if not prompts and not negatives:  # a separator alone, which is searched for as it stands
+        prompts = [part]
     return [(prompt, negatives) for prompt in prompts or [""]]
 
 

@@ -33,7 +33,7 @@ class Things:
     least: int
     """Number of the things that three or more photos show."""
     most: int
-    """Number of the things and of the candidates that a single photo shows."""
+    """Number of the things and of all candidates: those that a single photo shows, and small ones."""
     caution: str | None = None
     """Why the answer is doubtful; None if it isn't."""
 
@@ -66,14 +66,15 @@ def things_of(scene: Scene, texts: str | Sequence[str]) -> list[Things]:
     answers, known = list[Things](), list[Thing]()
     for i, prompt in enumerate(question.prompts):
         weight = np.sqrt(mass) * question.relevancy[i].double().cpu().numpy()
-        joined = without_crumbs(join(pieces[i], weight))
+        candidates = join(pieces[i], weight)
+        joined = without_crumbs(candidates)
         sure = [one for one in joined if one.views >= VIEWS]
         things = [_thing(scene, prompt.text, one, mass, question.relevancy[i], up) for one in sure]
         things = [_known(thing, known, mass) for thing in things]
         known += things
         least = sum(one.views > VIEWS for one in joined)
         caution = doubtful(prompt.text, question.doubts[i], prompt.taught is not None)
-        answers.append(Things(prompt.text, things, least, len(joined), caution))
+        answers.append(Things(prompt.text, things, least, len(candidates), caution))
     return answers
 
 

@@ -47,8 +47,8 @@ def join(pieces: Sequence[Piece], weight: Float[Array, " n"]) -> list[Joined]:
     """Join the pieces of all views, from the finest resolution to the coarsest.
 
     A piece founds a thing if its Gaussians are mostly free, confirms the thing that it shares most with, and
-    says nothing if it covers several things (a coarse view joins neighbors that a fine one tells apart), or if
-    it is cut off and new. Things that some piece covers together, and no photo shows apart, are one: two
+    says nothing if it covers several things (a coarse view joins neighbors that a fine one tells apart), or
+    if it is cut off and new. Things that some piece covers together, and no photo shows apart, are one: two
     sides of a tower. `weight` is each Gaussian's weight, 0 and above.
     """
     owner, things = np.full(len(weight), -1), list[Joined]()

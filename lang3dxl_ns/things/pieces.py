@@ -1,4 +1,4 @@
-"""Pieces of heat maps: the connected regions of one view, split where they are narrow, and their Gaussians."""
+"""Pieces of heat maps: connected regions of one view, split where they fall apart, and their Gaussians."""
 
 from __future__ import annotations
 

@@ -28,10 +28,10 @@ def write_catalog(scene: Scene, answers: Sequence[Things], folder: Path) -> None
     make_folder(folder)
     things = _each_once(answers)
     up = up_of(scene)
-    graph = [[a.id, "in", b.id] for a in things for b in things if a.id != b.id and a.size.prod() < b.size.prod()
-             and holds(a, "in", b, Sight(up, up, up))]  # fmt: skip
-    words = [{"word": one.word, "count": len(one.things), "least": one.least, "most": one.most,
-              "caution": one.caution, "things": [thing.id for thing in one.things]} for one in answers]  # fmt: skip
+    view = Sight(up, up, up)  # "in" needs no directions
+    pairs = [(a, b) for a in things for b in things if a.id != b.id and a.size.prod() < b.size.prod()]
+    graph = [[a.id, "in", b.id] for a, b in pairs if holds(a, "in", b, view)]
+    words = [_summary(one) for one in answers]
     content = {"words": words, "things": [t.as_json() for t in things], "relations": graph, "up": up.tolist()}
     write_atomically(folder / "things.json", json.dumps(content, indent=1) + "\n")
     rows = io.StringIO()
@@ -43,6 +43,11 @@ def write_catalog(scene: Scene, answers: Sequence[Things], folder: Path) -> None
         table.writerow([thing.id, thing.word, round(thing.score, 3), thing.views, *numbers, seen])
     write_atomically(folder / "things.csv", rows.getvalue())
     write_atomically(folder / "instances.json", json.dumps(coco(scene, answers)) + "\n")
+
+
+def _summary(one: Things) -> dict[str, Any]:
+    numbers = {"count": len(one.things), "least": one.least, "most": one.most}
+    return {"word": one.word, **numbers, "caution": one.caution, "things": [thing.id for thing in one.things]}
 
 
 def coco(scene: Scene, answers: Sequence[Things]) -> dict[str, Any]:

@@ -17,8 +17,9 @@ from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.device import to_device
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.memory import machine_memory
+from lang3dxl_ns.preparation.encoders import usual_dense
 from lang3dxl_ns.preparation.foreground import with_foreground
-from lang3dxl_ns.preparation.model_files import CLIP_OPTION, find_model
+from lang3dxl_ns.preparation.model_files import CLIP_OPTION, find_model, usual_clip
 from lang3dxl_ns.preparation.needs import Need, scene_needs
 from lang3dxl_ns.preparation.photo_cache import PhotoCache, has_vanished
 from lang3dxl_ns.preparation.physical_scale import plan_crops
@@ -39,6 +40,17 @@ MOST_GONE = 0.1
 """Share of the training photos that may vanish before training ends."""
 ORDER_SEED = 42
 """Seed of the order of photos."""
+
+
+def settle(config: PreparationConfig, learned: bool, gathered: bool) -> None:
+    """Resolve what is prepared, in place: semantics `learned` with the scene use regions in every step;
+    features `gathered` onto Gaussians, also those that codes start from, need fine crops."""
+    config.clip = usual_clip(config.clip)
+    if config.crops == "auto":
+        config.crops = "fine" if gathered else "pyramid"
+    if not learned or config.clip == "none":
+        config.regions = "none"
+    config.dense = "none" if config.clip == "none" else usual_dense(config, learned)
 
 
 def read_data(

@@ -28,7 +28,7 @@ from lang3dxl_ns.preparation.settings import PreparationConfig
 from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.scene.capture import Capture, open_capture, say_left_out
 from lang3dxl_ns.scene.photo_folder import check_data
-from lang3dxl_ns.training.batches import TrainingData
+from lang3dxl_ns.training.batches import TrainingData, settle
 from lang3dxl_ns.training.checkpoint import CHECKPOINT, read_checkpoint, save_checkpoint
 from lang3dxl_ns.training.learn_codes import forget_words, learn_words
 from lang3dxl_ns.training.learning_rates import Rates, learning_rates, printed_learning_rates
@@ -86,7 +86,7 @@ class Settings:
             if schedule is not None:
                 schedule.total_steps = self.steps
         learned = self.scene.learns_from_renderings
-        self.targets.settle(learned, not learned or self.scene.codes_from == "photos")
+        settle(self.targets, learned, not learned or self.scene.codes_from == "photos")
 
 
 class Run:

@@ -11,15 +11,19 @@ from lang3dxl_ns.training.state import Training
 PER_PARAMETER = 16.0
 """Bytes per parameter for its value, its gradient, and Adam's two moments."""
 PER_GAUSSIAN = 1_500.0
-"""Bytes of a step's other tensors per Gaussian, measured with 300,000 of them. Learning words takes less."""
+"""Bytes of a step's other tensors per Gaussian on a CPU, whose threads sum gradients separately, measured
+with 300,000 of them. Learning words takes less."""
+PER_GAUSSIAN_ON_GPU = 150.0
+"""The same on a GPU. On an H200 a step of a million Gaussians in one color held .54 GB in all, where this
+plan says .71; learning their words held 1.15, where it says 1.57 (docs/gpu.md)."""
 PER_LOOK = 3_000.0
 """Additional bytes per Gaussian in view, with appearance."""
 PER_PIXEL = 480.0
 """Bytes of a step per pixel of the photo."""
 PER_CODE = 12.0
 """Bytes of a step per Gaussian and number of its code. Codes are drawn at few pixels."""
-WORDS = 1.5e9
-"""Most bytes, in addition to the model, that learning words takes after the last step."""
+WORDS = {"cpu": 1.5e9, "cuda": 1.2e9}
+"""Most bytes, in addition to the model, that learning words takes after the last step, by device."""
 CONTEXT = 0.8e9
 """Bytes of CUDA's context, its libraries, and gaps between tensors."""
 SHARE = 0.85
@@ -33,14 +37,16 @@ def bytes_of(run: Training, pixels: int) -> tuple[float, float]:
     count, modules = len(run.gaussians["means"]), run.parts.modules().values()
     numbers = sum(p.numel() for p in run.gaussians.values()) / count
     others = sum(p.numel() for module in modules for p in module.parameters())
-    words = WORDS if run.learns_words_at_the_end else 0.0
+    on_gpu = run.device.type == "cuda"
+    words = WORDS["cuda" if on_gpu else "cpu"] if run.learns_words_at_the_end else 0.0
     codes = run.gaussians["codes"] if run.learns_from_renderings and "codes" in run.gaussians else None
     of_codes = 0.0 if codes is None else PER_CODE * codes.shape[1]
     # Of two threads, `PER_GAUSSIAN` has the sums.
-    many = run.gaussians["means"].device.type == "cpu" and torch.get_num_threads() > 2
+    many = not on_gpu and torch.get_num_threads() > 2
     fixed = PER_PARAMETER * others + max(PER_PIXEL * pixels, words) + many * MOST_SUMS
+    others_each = PER_GAUSSIAN_ON_GPU if on_gpu else PER_GAUSSIAN
     looks = 0.0 if run.parts.appearance is None else PER_LOOK
-    return fixed, PER_PARAMETER * numbers + PER_GAUSSIAN + of_codes + looks
+    return fixed, PER_PARAMETER * numbers + others_each + of_codes + looks
 
 
 def memory_to_plan_with(device: torch.device) -> float:

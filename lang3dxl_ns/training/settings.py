@@ -67,17 +67,9 @@ class CameraRefinementConfig:
 
 
 @dataclass
-class TrainingSettings:
-    """Settings of Gaussians, their parts, losses and schedules."""
+class SceneSettings:
+    """Settings of Gaussians, losses and schedules: numbers and choices."""
 
-    decoder: DecoderConfig = field(default_factory=DecoderConfig)
-    """Feature decoder: the semantic field, or a baseline."""
-    semantic_field: SemanticFieldConfig = field(default_factory=SemanticFieldConfig)
-    """Settings of the field that decodes a 3-number code to CLIP and dense features."""
-    downsampler: DownsamplerConfig = field(default_factory=DownsamplerConfig)
-    """Settings of the training-only network that reduces decoded features to the CLIP target's grid."""
-    appearance: AppearanceConfig = field(default_factory=AppearanceConfig)
-    """Settings of colors that depend on each photo's lighting."""
     clip_weight: float = 1.0
     """Weight of the CLIP loss, a mean absolute difference."""
     dense_weight: float | None = None
@@ -103,8 +95,6 @@ class TrainingSettings:
     and a quarter of the numbers per Gaussian. `auto` decides by measuring the scene."""
     camera_optimization: Literal["auto", "on", "off"] = "auto"
     """Refine the cameras during training. `auto`: if the COLMAP model's reprojection error is large."""
-    camera_optimizer: CameraRefinementConfig = field(default_factory=CameraRefinementConfig)
-    """How cameras are refined."""
     rasterizer: Literal["auto", "gsplat", "torch"] = "auto"
     """Rasterizer on a GPU. `auto`: gsplat, which is built at its first use (docs/gpu.md), or, if the build
     fails, torch, which is many times slower."""
@@ -145,6 +135,22 @@ class TrainingSettings:
     densify_grad_thresh: float | None = None
     """Screen-space gradient (image = [−1, 1]) above which Gaussians are split or duplicated. None: 2e-3 in
     short runs, which densify while gradients are still large, falling to 2e-4 (the paper's) in long ones."""
+
+
+@dataclass
+class TrainingSettings(SceneSettings):
+    """Settings of Gaussians, their parts, losses and schedules."""
+
+    decoder: DecoderConfig = field(default_factory=DecoderConfig)
+    """Feature decoder: the semantic field, or a baseline."""
+    semantic_field: SemanticFieldConfig = field(default_factory=SemanticFieldConfig)
+    """Settings of the field that decodes a 3-number code to CLIP and dense features."""
+    downsampler: DownsamplerConfig = field(default_factory=DownsamplerConfig)
+    """Settings of the training-only network that reduces decoded features to the CLIP target's grid."""
+    appearance: AppearanceConfig = field(default_factory=AppearanceConfig)
+    """Settings of colors that depend on each photo's lighting."""
+    camera_optimizer: CameraRefinementConfig = field(default_factory=CameraRefinementConfig)
+    """How cameras are refined."""
 
     def check(self) -> None:
         """Raise UserError if a setting is out of its range."""

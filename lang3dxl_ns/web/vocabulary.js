@@ -27,7 +27,8 @@ export function parsePrompts(typed) {
   return parts
     .flatMap((part) => {
       const [wanted, ...others] = part.split(whole("not")), negatives = others.flatMap(listed).map(restored).filter(Boolean);
-      return listed(wanted).map((text) => ({ text: restored(text), negatives }));
+      const prompts = listed(wanted), alone = prompts.length || negatives.length ? prompts : [part]; // a separator alone
+      return alone.map((text) => ({ text: restored(text), negatives }));
     })
     .filter(({ text }) => text);
 }

@@ -309,7 +309,8 @@ def write_page(page: Page, folder: Path) -> int:
     if taken and not ours:
         raise UserError(f"{folder} holds {taken[0]}, which is not a scene's page: name a folder of its own")
     files = page.files()
-    own, data = [path.name for path in _FILES], sorted(files.keys() - {path.name for path in _FILES})
+    own = [*(path.name for path in _FILES), "language.js"]  # modules import each other by these names
+    data = sorted(files.keys() - {*own})
     data.remove("scene.json")
     # Data have names by content, which scene.json lists: a page whose writing is stopped, or whose files a
     # browser or a copy keeps from earlier, never shows the splats of one scene with the words of another.

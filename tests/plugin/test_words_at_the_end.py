@@ -154,7 +154,7 @@ def test_words_are_the_same_from_photos_gathered_smaller(trained, scene, monkeyp
 
     monkeypatch.setattr(CompressedField, "learn_gaussians", noted)
     trainer = run()
-    monkeypatch.setattr("lang3dxl_ns.plugin.model.LONGER_SIDE", 48)
+    monkeypatch.setattr("lang3dxl_ns.training.learn_codes.LONGER_SIDE", 48)
     trainer.pipeline.learn_words()
     (whole, mass), (half, smaller) = found
     seen = (mass > 20) & (smaller > 5)
