@@ -83,7 +83,7 @@ def test_commands_run_from_it_alone(wheel, tmp_path):
     assert done.stdout.startswith(str(tmp_path / "installed"))
     assert "holyscenes/milano" in done.stdout
     assert "Targets of 4 photos" in done.stdout
-    page = tmp_path / "installed" / "lang3dxl_ns" / "query" / "web"
+    page = tmp_path / "installed" / "lang3dxl_ns" / "web"
     assert {path.name for path in page.iterdir()} >= {"index.html", "page.js", "splats.js", "LICENSES.txt"}
 
 

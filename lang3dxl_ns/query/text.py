@@ -60,6 +60,8 @@ def texts_of(texts: Any, what: str) -> list[str]:
 
 def taught_prompt(word: str) -> Prompt:
     """Return the prompt of a word that is to be taught. Raises UserError if no prompt means this word."""
+    if not re.search(r"\w", word):
+        raise UserError("the prompt is empty: type what to look for, such as rose window")
     prompt, *more = parse_prompts(word if '"' in word else f'"{word}"')
     if more or known_word(prompt.text) != known_word(word):
         raise UserError(f"no prompt means {word!r}: name the word without quotes and semicolons")

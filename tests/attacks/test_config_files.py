@@ -299,10 +299,10 @@ def test_configs_of_other_methods_are_left_to_nerfstudio(tmp_path):
 
 
 def test_photos_that_may_not_be_read_are_not_taken_for_gone(copy, monkeypatch):
-    def refused(_):
+    def refused(*_, **__):
         raise PermissionError(13, "Permission denied")
 
-    monkeypatch.setattr("lang3dxl_ns.plugin.datamanager.check_transforms", refused)
+    monkeypatch.setattr("lang3dxl_ns.plugin.dataparser.open_capture", refused)
     with pytest.raises(PermissionError):
         open_run(copy / "config.yml")
 

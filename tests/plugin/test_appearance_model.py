@@ -130,7 +130,7 @@ def test_gaussians_out_of_view_need_no_light(lit, monkeypatch):
     camera = eval_camera(trainer)
     some = show(trainer.pipeline.model, camera)["rgb"]
     monkeypatch.setattr(
-        "lang3dxl_ns.plugin.rendering_model.in_view",
+        "lang3dxl_ns.components.appearance.in_view",
         lambda camera, means, scales: torch.ones(len(means), dtype=torch.bool),
     )
     torch.testing.assert_close(some, show(trainer.pipeline.model, camera)["rgb"])

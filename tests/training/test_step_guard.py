@@ -113,9 +113,9 @@ def test_a_skipped_step_changes_no_parameter_no_moment_and_no_strategy(train, sc
 
 
 def test_a_broken_gradient_of_a_finite_loss_is_kept_out_after_densification_too(train, scene, monkeypatch):
-    from lang3dxl_ns.plugin import model
+    from lang3dxl_ns.components import losses
 
-    right, calls = model.losses.rgb_loss, []
+    right, calls = losses.rgb_loss, []
 
     def breaking(prediction, *rest):
         calls.append(prediction.requires_grad)
@@ -123,7 +123,7 @@ def test_a_broken_gradient_of_a_finite_loss_is_kept_out_after_densification_too(
             prediction.register_hook(lambda gradient: gradient * math.nan)
         return right(prediction, *rest)
 
-    monkeypatch.setattr(model.losses, "rgb_loss", breaking)
+    monkeypatch.setattr(losses, "rgb_loss", breaking)
     changes = {"pipeline__model__densify_grad_thresh": 1e-7, "steps_per_eval_image": 0}
     trainer = train(scene, iterations=30, semantics=False, **changes)
     assert trainer.guard.skipped == 10
