@@ -45,7 +45,7 @@ _READ_BY |= {"vocabulary": ("web",), "photos": ("web",), "all": ("out",), "hide_
 _Not = Annotated[tyro.conf.UseAppendAction[list[str]], tyro.conf.arg(name="not")]
 
 
-@showing("scene", "text", "not_", "out", "image", "all", "camera_path", "settings")
+@showing("scene", "text", "not_", "out", "image", "all", "camera_path", "coco", "settings")
 @dataclass(kw_only=True)
 class Query:
     """Search a trained scene for texts: write heat maps, masks and relevancy maps.

@@ -17,6 +17,7 @@ from lang3dxl_ns.training.settings import SceneSettings
 
 @showing(
     *("data", "out", "method", "steps", "restart", "clip", "quality", "foreground", "workers", "photo_scale"),
+    "looks",
 )
 @without("total_steps")
 @dataclass(kw_only=True)
