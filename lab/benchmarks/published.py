@@ -40,7 +40,7 @@ class BenchmarkScene:
     truth: Path
 
 
-@showing("data", "out", "scenes")
+@showing("data", "out")
 @dataclass(kw_only=True)
 class _Benchmark:
     data: Path

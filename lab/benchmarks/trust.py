@@ -11,6 +11,7 @@ from sklearn.metrics import average_precision_score
 from lab.reports import command_line
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.reports import markdown_table, write_report
+from lang3dxl_ns.common.settings_help import showing
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth
 from lang3dxl_ns.evaluation.score_scene import labeled_photos, truths_of
 from lang3dxl_ns.query.scene import Scene
@@ -31,6 +32,7 @@ _STEP = 3
 """Every third pixel is scored."""
 
 
+@showing("scene", "ground_truth", "out")
 @dataclass
 class TrustBenchmark:
     """Ask scenes every word with labels, and forty words for absent things."""

@@ -34,7 +34,7 @@ RUN = Path("run", "lang3dxl", "demo")
 """Folder of the run inside the demo's folder."""
 
 
-@showing("out", "quick", "steps", "seed")
+@showing("out", "quick", "seed")
 @dataclass
 class Demo:
     """See the full workflow in minutes, without any data: generate a landmark that the built-in CLIP has

@@ -13,7 +13,7 @@ FOLDER, CAMERAS = "test_views", "cameras.json"
 """Folder of a scene's test views, and the file in it that lists their cameras."""
 
 
-@showing("out", "photos", "seed", "family")
+@showing("out", "seed", "family")
 @dataclass
 class DemoScene:
     """Generate a demo scene: photos of a procedural landmark."""

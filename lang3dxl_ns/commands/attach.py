@@ -21,8 +21,7 @@ if TYPE_CHECKING:
 
 
 @showing(
-    *("splat", "data", "out", "text", "clip", "quality", "views", "up", "foreground", "segment"),
-    *("workers", "cache_dir"),
+    *("splat", "data", "out", "text", "clip", "up", "foreground", "segment"),
 )
 @dataclass(kw_only=True)
 class Attach(AttachConfig):

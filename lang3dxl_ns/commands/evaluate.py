@@ -32,7 +32,7 @@ class _Scored:
     """Folder for the report."""
 
 
-@showing("maps", "ground_truth", "layout", "photos", "masks", "out")
+@showing("maps", "ground_truth", "photos", "masks", "out")
 @dataclass(kw_only=True)
 class EvaluateMaps(_Scored):
     """Score relevancy maps made by any system, and write scores.md and scores.json.
@@ -68,6 +68,7 @@ class EvaluateMaps(_Scored):
         write_scores(self.out, self.scene or name, results)
 
 
+@showing("run", "split", "ground_truth", "out")
 @dataclass(kw_only=True)
 class EvaluateRun(_Scored):
     """Score a trained run like `ns-eval`, but on photos and with ground truth of your choice.

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from lang3dxl_ns.plugin.datamanager import Lang3DXLDataManager
 
 
+@showing("data", "features", "max_features", "one_camera")
 @dataclass(kw_only=True)
 class Reconstruct(ReconstructionSettings):
     """Reconstruct photos: cameras, poses and points, as a COLMAP model.
@@ -38,7 +39,7 @@ class Reconstruct(ReconstructionSettings):
         say(f"The model is in {model}. Train with: ns-train lang3dxl --data {shlex.quote(str(data))}")
 
 
-@showing("data", "clip", "dense", "quality", "foreground", "regions", "workers", "cache_dir")
+@showing("data", "clip", "quality", "foreground", "workers", "cache_dir")
 @dataclass(kw_only=True)
 class Prepare(PreparationConfig):
     """Make the targets that training learns from, in advance.

@@ -45,7 +45,7 @@ _READ_BY |= {"vocabulary": ("web",), "photos": ("web",), "all": ("out",), "hide_
 _Not = Annotated[tyro.conf.UseAppendAction[list[str]], tyro.conf.arg(name="not")]
 
 
-@showing("scene", "text", "not_", "out", "image", "all", "camera_path", "coco", "clip", "settings")
+@showing("scene", "text", "not_", "out", "image", "all", "camera_path", "coco", "settings")
 @dataclass(kw_only=True)
 class Query:
     """Search a trained scene for texts: write heat maps, masks and relevancy maps.
@@ -225,7 +225,7 @@ def _text_report(
 
 @showing(
     *("scene", "text", "not_", "out", "web", "scene_file", "title", "credit", "license", "all"),
-    *("look", "clip", "settings"),
+    *("look", "settings"),
 )
 @dataclass(kw_only=True)
 class Export:

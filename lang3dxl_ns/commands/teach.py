@@ -12,12 +12,14 @@ import tyro
 from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import file_locked
+from lang3dxl_ns.common.settings_help import showing
 
 if TYPE_CHECKING:
     from lang3dxl_ns.query.scene import Scene
     from lang3dxl_ns.words.taught_words import Example, TaughtWord
 
 
+@showing("scene", "word", "photo", "mask", "box", "at", "not_at")
 @dataclass(kw_only=True)
 class Teach:
     """Show a scene what a word means, by marking it in a photo with an outline, a box, or points.
@@ -72,6 +74,7 @@ class Teach:
         return Example(self.photo, mask, box, points, others)  # type: ignore[arg-type]
 
 
+@showing("scene", "forget", "save", "load")
 @dataclass(kw_only=True)
 class Words:
     """List the words that a scene was taught, remove them, or carry them to other scenes of the same CLIP."""

@@ -16,9 +16,8 @@ from lang3dxl_ns.training.settings import SceneSettings
 
 
 @showing(
-    *("data", "out", "method", "steps", "restart", "clip", "dense", "quality", "longer_side", "looks"),
-    *("foreground", "workers", "cache_dir", "photo_scale", "sky_gaussians", "max_gaussians"),
-    *("view_dependence", "camera_optimization"),
+    *("data", "out", "method", "steps", "restart", "clip", "quality", "foreground", "workers", "photo_scale"),
+    "looks",
 )
 @without("total_steps")
 @dataclass(kw_only=True)

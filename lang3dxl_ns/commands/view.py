@@ -16,7 +16,7 @@ from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.settings_help import showing
 
 
-@showing("scene", "text", "photos", "host", "port", "browser", "clip")
+@showing("scene", "text", "photos", "host", "port", "browser")
 @dataclass(kw_only=True)
 class View:
     """Explore and query a scene in a browser.

@@ -70,7 +70,7 @@ def read_splats(path: str | Path) -> Splats:
         files = sorted(path.parent.glob(f"{ranks[1]}*.pt")) if ranks else [path]
         splats = _joined([reader(file) for file in files])
     except ImportError as error:
-        raise UserError(f"{path.suffix} files need gsply: pip install 'lang3dxl-ns[share]'") from error
+        raise UserError(f"{path.suffix} files need gsply: pip install -e '.[share]'") from error
     except UserError as error:
         raise UserError(f"{path}: {error}") from error
     except DAMAGE as error:

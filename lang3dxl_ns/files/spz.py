@@ -84,7 +84,7 @@ def _zstd_parts(after: bytes, sizes: list[int], streams: int) -> tuple[BytesIO, 
     try:
         import zstandard
     except ImportError as error:
-        raise UserError("SPZ of version 4 needs zstandard: pip install 'lang3dxl-ns[share]'") from error
+        raise UserError("SPZ of version 4 needs zstandard: pip install -e '.[share]'") from error
     content = bytes(_HEADER.size) + after
     start = struct.unpack_from("<I", content, _HEADER.size)[0]
     expect(streams == len(sizes), f"it has {streams} streams, not {len(sizes)}")

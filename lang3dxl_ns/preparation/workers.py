@@ -108,7 +108,7 @@ def _run_on_ray(config: PreparationConfig, start: Start[Item, Result], items: Se
         import ray
         from ray.util import ActorPool
     except ImportError as error:
-        raise UserError("--engine ray needs Ray: pip install 'lang3dxl-ns[ray]'") from error
+        raise UserError("--engine ray needs Ray: pip install -e '.[ray]'") from error
     started = not ray.is_initialized()
     if started:
         _connect(ray, config)

@@ -37,7 +37,7 @@ _BOUNDS = {
 }
 
 
-@showing("threshold", "size", "foreground")
+@showing("threshold", "foreground")
 @dataclass
 class QueryConfig:
     """Settings of queries."""

@@ -2,7 +2,7 @@
 
 gsplat's own build starts when the first frame is rendered, runs ten compilers at a time whatever the memory,
 and deletes its folder when it is interrupted. This build keeps what is compiled, and needs no system CUDA
-toolkit: `pip install 'lang3dxl-ns[cuda]'` brings the compilers of torch's CUDA.
+toolkit: `pip install -e '.[cuda]'` brings the compilers of torch's CUDA.
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ def needs(folder: Path) -> list[Need]:
         trouble = "a space in its name, which the compilers' rules can't hold"
     nvcc = f"install the CUDA toolkit {cuda} and set CUDA_HOME to it, or torch's CUDA 13 build"
     if cuda.startswith("13."):
-        nvcc = f"pip install 'lang3dxl-ns[cuda]' (or a system CUDA toolkit {cuda}, with CUDA_HOME at it)"
+        nvcc = f"pip install -e '.[cuda]' (or a system CUDA toolkit {cuda}, with CUDA_HOME at it)"
     apt, cub = f"apt install g++ {python}-dev", f"nvcc and cub of CUDA {cuda.partition('.')[0] or '13'}"
     compiler, ninja = (shutil.which(x, path=_path()) for x in (os.environ.get("CXX", "g++"), "ninja"))
     disk = f"{trouble}: free half a gigabyte, or set TORCH_EXTENSIONS_DIR"

