@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any, Literal
 from rich import get_console
 from rich.markdown import Markdown
 
-from lab.landmark.picture import CAPTION
 from lab.reports import command_line, with_flags
 from lab.stages import MeasuredStages
 from lang3dxl_ns.common.checks import check_numbers
@@ -114,6 +113,8 @@ class Demo:
 
             draw_picture(most_telling(rows, 3), folder / "report.png")
         get_console().print(Markdown(self.markdown(report)))
+        from lab.landmark.picture import CAPTION
+
         say(f"\nReport: {folder / 'report.md'}. Picture: {folder / 'report.png'} ({CAPTION})")
         run = shlex.quote(os.path.relpath(out))
         say(

@@ -4,19 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import numpy as np
 import tyro
 
 from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.settings_help import showing
-from lang3dxl_ns.open_scene import load_scene
-from lang3dxl_ns.query.scene import Scene
-from lang3dxl_ns.things.find import things_of, up_of
-from lang3dxl_ns.things.grammar import Sight, answer, parse
-from lang3dxl_ns.things.thing import Thing
-from lang3dxl_ns.things.write import write_catalog, write_picture, write_things
+
+if TYPE_CHECKING:
+    from lang3dxl_ns.things.thing import Thing
 
 
 @showing("scene", "text", "ask", "out", "splats", "view")
@@ -43,6 +40,11 @@ class ListThings:
     """Name or folder of the scene's CLIP, if it is not where the scene file says."""
 
     def main(self) -> None:
+        from lang3dxl_ns.open_scene import load_scene
+        from lang3dxl_ns.things.find import sight_of, things_of
+        from lang3dxl_ns.things.grammar import answer, parse
+        from lang3dxl_ns.things.write import write_catalog, write_picture, write_things
+
         requests = [(text, parse(text)) for text in self.ask]
         words = list(
             dict.fromkeys([*self.text, *(word for _, request in requests for word in request.words)])
@@ -73,19 +75,6 @@ class ListThings:
             if self.splats:
                 write_things(scene, answers, self.out / "splats")
             say(f"Wrote the things to {self.out}")
-
-
-def sight_of(scene: Scene, things: list[Thing], photo: str | None = None) -> Sight:
-    """Return the directions of a photo's viewer; by default of the photo that shows most of the things."""
-    names = [sighting.photo for thing in things for sighting in thing.sightings]
-    if photo is None and names:
-        photo = max(sorted(set(names)), key=names.count)
-    shown = scene.overview if photo is None else scene.file.photo(photo)
-    up = up_of(scene)
-    ahead = -np.array(shown.camera_to_world)[:, 2]
-    ahead = ahead - up * (ahead @ up)
-    ahead /= max(np.linalg.norm(ahead), 1e-9)
-    return Sight(np.cross(ahead, up), up, ahead)
 
 
 def _described(thing: Thing) -> str:

@@ -232,10 +232,18 @@ class ViewersCameras(CameraOptimizer):
 
     def __init__(self, cameras: CameraRefinement | None, count: int) -> None:
         super().__init__(CameraOptimizerConfig(mode="off"), num_cameras=count, device="cpu")
-        self._motions = None if cameras is None else cameras.motions
+        self._refined = (cameras,)  # in a tuple: as a module, checkpoints would name its parameter otherwise
         if cameras is not None:
             self.pose_adjustment = cameras.pose_adjustment
 
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> ViewersCameras:
+        """Convert the parameter, as when the model moves to a GPU, and keep it the run's own."""
+        super()._apply(fn, recurse)
+        if self._refined[0] is not None:
+            self._refined[0].pose_adjustment = self.pose_adjustment
+        return self
+
     def forward(self, indices: Tensor) -> Tensor:
         """Return the motions of some training cameras."""
-        return super().forward(indices) if self._motions is None else self._motions(indices)
+        (cameras,) = self._refined
+        return super().forward(indices) if cameras is None else cameras.motions(indices)

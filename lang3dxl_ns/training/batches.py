@@ -194,7 +194,7 @@ class TrainingData:
                 *self._described(others, "eval", torch.from_numpy(self.capture.poses(others))),
             ],
             clip=None if known is None else known.address,
-            clip_identity=None if known is None else known.identity,
+            clip_identity=None if known is None else known.clip_identity,
             scale=frame.scale,
             transform=frame.transform.tolist(),
             data=str(self.capture.folder),

@@ -123,7 +123,7 @@ class Handler(BaseHTTPRequestHandler):
     def _answer(self, answer: Callable[[], tuple[HTTPStatus, str, bytes]]) -> None:
         refused = self.server.access.refusal(self.path, self.headers)
         if refused is not None:
-            self.close_connection = self.command == "POST"
+            self.close_connection = self.close_connection or self.command == "POST"
             return self._send(*refused)
         try:
             status, kind, content = answer()

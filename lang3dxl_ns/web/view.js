@@ -186,6 +186,8 @@ export class View extends EventTarget {
     let down = null, before = null;
     const near = (one, other) => Math.hypot(one.clientX - other.clientX, one.clientY - other.clientY) < 6;
     this.canvas.addEventListener("pointerdown", (event) => (down = event.isPrimary ? event : null));
+    // A click on anything between two clicks on one place makes them two single ones.
+    addEventListener("pointerdown", (event) => { if (event.target !== this.canvas) before = null; }, true); // prettier-ignore
     this.canvas.addEventListener("pointerup", (event) => {
       if (!down || !near(event, down) || event.timeStamp - down.timeStamp > 600 || event.button > 0) return;
       const corner = this.canvas.getBoundingClientRect();

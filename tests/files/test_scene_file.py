@@ -67,7 +67,7 @@ def written(tmp_path):
 def test_a_scene_survives_its_file(written):
     scene, path = written
     found = read_scene(path, "cpu", encode_texts=encode_texts)
-    for word in ("dome", "window not a word", "wall"):
+    for word in ("dome", '"window not a word"', "wall"):
         np.testing.assert_allclose(found.relevancy(word), scene.relevancy(word), atol=ATOL)
     for photo in ("0001", "0003"):
         here, there = scene.query("dome", photo), found.query("dome", photo)

@@ -75,9 +75,9 @@ def test_the_folders_own_statistics_are_used(clip, clip_folder, tmp_path):
 
 def test_identity_follows_the_content_and_not_the_place(clip, clip_folder, tmp_path):
     moved = shutil.copytree(clip_folder, tmp_path / "elsewhere")
-    assert find_model(moved, "--clip").identity == clip.identity
+    assert find_model(moved, "--clip").clip_identity == clip.identity
     fine_tuned = make_tiny_clip(tmp_path / "fine-tuned", seed=1)
-    assert find_model(fine_tuned, "--clip").identity != clip.identity
+    assert find_model(fine_tuned, "--clip").clip_identity != clip.identity
 
 
 def test_checkpoints_without_safetensors_load_too(clip, clip_folder, tmp_path):
