@@ -41,8 +41,9 @@ class ListThings:
 
     def main(self) -> None:
         from lang3dxl_ns.open_scene import load_scene
-        from lang3dxl_ns.things.find import sight_of, things_of
+        from lang3dxl_ns.things.find import things_of
         from lang3dxl_ns.things.grammar import answer, parse
+        from lang3dxl_ns.things.sight import sight_of
         from lang3dxl_ns.things.write import write_catalog, write_picture, write_things
 
         requests = [(text, parse(text)) for text in self.ask]

@@ -14,7 +14,6 @@ from torch import Tensor
 from lang3dxl_ns.query.doubt import doubtful, peaks
 from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.rendering import composite
-from lang3dxl_ns.things.grammar import Sight
 from lang3dxl_ns.things.join import VIEWS, Joined, join, without_crumbs
 from lang3dxl_ns.things.pieces import LEVELS, Piece, Shown, pieces_of
 from lang3dxl_ns.things.thing import Sighting, Thing, upright_box
@@ -156,16 +155,3 @@ def _known(thing: Thing, known: Sequence[Thing], mass: Float[Array, " n"]) -> Th
         if shared > _SAME * mass[np.union1d(thing.rows, other.rows)].sum():
             return replace(thing, id=other.id)
     return thing
-
-
-def sight_of(scene: Scene, things: list[Thing], photo: str | None = None) -> Sight:
-    """Return the directions of a photo's viewer; by default of the photo that shows most of the things."""
-    names = [sighting.photo for thing in things for sighting in thing.sightings]
-    if photo is None and names:
-        photo = max(sorted(set(names)), key=names.count)
-    shown = scene.overview if photo is None else scene.file.photo(photo)
-    up = up_of(scene)
-    ahead = -np.array(shown.camera_to_world)[:, 2]
-    ahead = ahead - up * (ahead @ up)
-    ahead /= max(np.linalg.norm(ahead), 1e-9)
-    return Sight(np.cross(ahead, up), up, ahead)

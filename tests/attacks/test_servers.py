@@ -134,11 +134,11 @@ def test_pages_of_other_origins_are_refused(page, origin):
     assert get(page, "/api/encode?text=x", Origin=origin).status == 403
 
 
-def test_other_sites_may_link_here_and_not_embed_this_server(server):
+def test_other_sites_may_link_here_and_not_embed_this_server(page):
     embedded = {"Sec-Fetch-Site": "cross-site", "Sec-Fetch-Mode": "no-cors"}
-    assert get(server, "/api/encode?text=x", **embedded).status == 403
-    assert get(server, "/", **(embedded | {"Sec-Fetch-Mode": "navigate"})).status == 200
-    assert get(server, "/", **(embedded | {"Sec-Fetch-Site": "same-origin"})).status == 200
+    assert get(page, "/api/encode?text=x", **embedded).status == 403
+    assert get(page, "/", **(embedded | {"Sec-Fetch-Mode": "navigate"})).status == 200
+    assert get(page, "/", **(embedded | {"Sec-Fetch-Site": "same-origin"})).status == 200
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "127.8.8.8", "::1", "localhost"])
