@@ -69,5 +69,5 @@ def plan(run: Training, pixels: int, device: torch.device, wanted: int | None) -
     return most, (
         f"memory of {where}: about {(fixed + now * each) / 1e9:.1f} GB with the first {now:,} Gaussians, "
         f"{each * 1e6 / 1e9:.1f} GB per million more; {memory / 1e9:.1f} GB to plan with, "
-        f"{limit} (--pipeline.model.max-gaussians)"
+        f"{limit} (max-gaussians)"
     )
