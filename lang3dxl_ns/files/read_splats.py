@@ -131,6 +131,6 @@ def _splat(path: Path) -> Splats:
 
 
 _READERS: dict[str, Callable[[Path], Splats]] = {
-    **{".ply": read_ply, ".spz": lambda path: read_spz(path)[0], ".splat": _splat},
+    **{".ply": read_ply, ".spz": read_spz, ".splat": _splat},
     **{".pt": read_checkpoint, ".pth": read_checkpoint, ".ckpt": read_checkpoint},
 }

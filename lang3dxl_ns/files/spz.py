@@ -1,7 +1,6 @@
 """SPZ, Niantic's compressed splats: versions 1 to 3 in one gzip stream, and version 4 in zstd streams.
 
-A Gaussian takes 8 bits per value, and 24 per coordinate. Records of vendors may follow; other readers skip
-those that they don't know.
+A Gaussian takes 8 bits per value, and 24 per coordinate. Records of vendors may follow, which are skipped.
 """
 
 from __future__ import annotations
@@ -9,7 +8,7 @@ from __future__ import annotations
 import gzip
 import struct
 from collections.abc import Iterator
-from io import BufferedIOBase, BytesIO
+from io import BufferedIOBase
 from math import floor, log2
 from pathlib import Path
 
@@ -28,16 +27,12 @@ _HEADER = struct.Struct("<IIIBBBB")
 """Magic, version, number of Gaussians, degree, fractional bits of coordinates, flags, number of streams."""
 _ANTIALIASED, _RECORDS = 1, 2
 """Bits of the flags."""
-_LARGEST_RECORD = 1 << 28
-_WORDS = 0x4C330001
-"""Type of the record with a scene's words: a vendor of ours ("L3") and its first record."""
 _HIGHEST_DEGREE = 4
 
 
-def read_spz(path: Path) -> tuple[Splats, bytes | None]:
-    """Read the Gaussians of a file of any version, and the record of their words, if there is one. No memory
-    is allocated beyond what the header announces. Raises UserError for an unknown version or degree, and
-    one of `DAMAGE` for a damaged file."""
+def read_spz(path: Path) -> Splats:
+    """Read the Gaussians of a file of any version. No memory is allocated beyond what the header announces.
+    Raises UserError for an unknown version or degree, and one of `DAMAGE` for a damaged file."""
     with path.open("rb") as file:
         packed = file.read(2) == b"\x1f\x8b"
         file.seek(0)
@@ -54,14 +49,13 @@ def read_spz(path: Path) -> tuple[Splats, bytes | None]:
             expect(bits <= 24, f"its coordinates have {bits} fractional bits")
             check_memory(count, ALL_BANDS)
             sides = _sides(version, degree)
-            records = BytesIO()
             if packed:
                 parts = [_exactly(stream, count * side) for side in sides]
                 expect(bool(flags & _RECORDS) or not stream.read(1), _MORE)
             else:
                 sizes = [count * side for side in sides if side]
-                records, parts = _zstd_parts(stream.read(), sizes, streams)
-            return _decoded(parts, count, version, bits, flags), _words(stream if packed else records)
+                parts = _zstd_parts(stream.read(), sizes, streams)
+            return _decoded(parts, count, version, bits, flags)
 
 
 _MORE = "it unpacks to more than its header announces"
@@ -78,9 +72,9 @@ def _exactly(stream: BufferedIOBase, size: int) -> bytes:
     return content
 
 
-def _zstd_parts(after: bytes, sizes: list[int], streams: int) -> tuple[BytesIO, list[bytes]]:
-    """Unpack version 4, whose bytes `after` the header hold vendors' records and streams of these sizes, and
-    return the records and what the streams hold."""
+def _zstd_parts(after: bytes, sizes: list[int], streams: int) -> list[bytes]:
+    """Unpack version 4, whose bytes `after` the header hold vendors' records, which are skipped, and
+    streams of these sizes."""
     try:
         import zstandard
     except ImportError as error:
@@ -101,17 +95,7 @@ def _zstd_parts(after: bytes, sizes: list[int], streams: int) -> tuple[BytesIO, 
         expect(len(part) == size, "it holds less than its header announces")
         parts.append(part)
         place += packed
-    return BytesIO(content[32:start]), parts
-
-
-def _words(records: BufferedIOBase) -> bytes | None:
-    """Find the record of the words among the records of all vendors."""
-    for kind, size in iter(lambda: struct.unpack("<II", records.read(8).ljust(8, b"\0")), (0, 0)):
-        expect(size <= _LARGEST_RECORD, f"a record announces {size:,} bytes")
-        content = _exactly(records, size)
-        if kind == _WORDS:
-            return content
-    return None
+    return parts
 
 
 def _decoded(parts: list[bytes], count: int, version: int, bits: int, flags: int) -> Splats:
@@ -155,19 +139,17 @@ def _quats_of_three(turns: UInt8[Array, "n 4"]) -> Float32[Array, "n 4"]:
     return np.roll(parts, 1, axis=1)
 
 
-def encode_spz(splats: Splats, words: bytes | None = None) -> bytes:
-    """Encode version 3, with a record of a scene's words. Raises UserError for coordinates too large for 24
-    bits."""
+def encode_spz(splats: Splats) -> bytes:
+    """Encode version 3. Raises UserError for coordinates too large for 24 bits."""
     farthest = float(splats.means.abs().max()) if len(splats) else 0.0
     bits = min(floor(22 - log2(max(farthest, 1e-3))), 20)
     if bits < 0:
         raise UserError(
             f".spz holds coordinates up to 4 million, and these reach {farthest:,.0f}: write a .ply"
         )
-    flags = _ANTIALIASED * splats.antialiased + _RECORDS * (words is not None)
+    flags = _ANTIALIASED * splats.antialiased
     head = _HEADER.pack(_MAGIC, 3, len(splats), splats.degree, bits, flags, 0)
-    record = b"" if words is None else struct.pack("<II", _WORDS, len(words)) + words
-    return gzip.compress(head + b"".join(_encoded(splats, bits)) + record)
+    return gzip.compress(head + b"".join(_encoded(splats, bits)))
 
 
 def _encoded(splats: Splats, bits: int) -> Iterator[bytes]:
