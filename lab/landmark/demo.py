@@ -79,12 +79,11 @@ class Demo:
 
     def _run(self, out: Path) -> None:
         from lang3dxl_ns.evaluation.score_run import Evaluation, EvaluationSettings
-        from lang3dxl_ns.preparation.model_files import check_encoders, option_prefix
+        from lang3dxl_ns.preparation.model_files import check_encoders
         from lang3dxl_ns.scene.capture import open_capture
         from lang3dxl_ns.training.checkpoint import CHECKPOINT
         from lang3dxl_ns.training.fit import begin
 
-        option_prefix.set("--")
         settings = self.settings(out)
         check_encoders(settings.targets.clip, settings.targets.dense)
         scene, stages = out / "scene", MeasuredStages(_SHARES, out / "stages.json")

@@ -57,11 +57,10 @@ class Prepare(PreparationConfig):
     or dense features with --dense none), and make none."""
 
     def main(self) -> None:
-        from lang3dxl_ns.preparation.model_files import check_encoders, option_prefix
+        from lang3dxl_ns.preparation.model_files import check_encoders
         from lang3dxl_ns.preparation.store import FeatureStore
         from lang3dxl_ns.scene.photo_folder import check_data
 
-        option_prefix.set("--")
         check_data(self.data)
         if not self.clean:
             check_encoders(self.clip, self.dense)
@@ -98,11 +97,9 @@ class Needs(PreparationConfig):
 def _opened(settings: PreparationConfig, data: Path, cache_dir: Path | None) -> TrainingData:
     """Open a folder of photos with these settings. Nothing is prepared yet."""
     from lang3dxl_ns.common.device import best_device
-    from lang3dxl_ns.preparation.model_files import option_prefix
     from lang3dxl_ns.scene.capture import open_capture, say_left_out
     from lang3dxl_ns.training.batches import TrainingData, settle
 
-    option_prefix.set("--")
     settings.check()
     capture = open_capture(data, cache_dir=cache_dir)
     say_left_out(capture)

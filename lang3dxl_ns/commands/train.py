@@ -54,10 +54,8 @@ class Train(SceneSettings, PreparationConfig):
     """Train anew, over the run in the folder."""
 
     def main(self) -> None:
-        from lang3dxl_ns.preparation.model_files import option_prefix
         from lang3dxl_ns.training.fit import run_folder
 
-        option_prefix.set("--")
         settings = self.settings()
         folder, _ = run_folder(self.data, self.out, settings, self.cache_dir, self.restart)
         run = shlex.quote(str(folder))

@@ -17,9 +17,10 @@ from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.device import to_device
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.memory import machine_memory
+from lang3dxl_ns.common.options import data_option
 from lang3dxl_ns.preparation.encoders import usual_dense
 from lang3dxl_ns.preparation.foreground import foreground_kind, with_foreground
-from lang3dxl_ns.preparation.model_files import CLIP_OPTION, find_model, option_prefix, usual_clip
+from lang3dxl_ns.preparation.model_files import CLIP_OPTION, find_model, usual_clip
 from lang3dxl_ns.preparation.needs import Need, scene_needs
 from lang3dxl_ns.preparation.photo_cache import PhotoCache, has_vanished
 from lang3dxl_ns.preparation.physical_scale import CropPlan, plan_crops
@@ -119,7 +120,7 @@ class TrainingData:
         if large:
             say(
                 f"{large} of {len(known)} photos are larger than {side:,} pixels and used at that size "
-                f"({option_prefix.get()}longer-side)"
+                f"({data_option('longer-side')})"
             )
         train, held_out = self.capture.split
         return [known[name] for name in dict.fromkeys((*train, *held_out))]
