@@ -99,6 +99,10 @@ class Capture:
     settings: CaptureSettings = field(default_factory=CaptureSettings)
     transforms: Transforms | None = None
     """Contents of the transforms.json, if it comes from one."""
+    known_split: Split | None = None
+    """The split, if another program chose it."""
+    known_frame: Frame | None = None
+    """Similarity to training's coordinates, if it is that of another capture or program."""
 
     @property
     def names(self) -> list[str]:
@@ -109,6 +113,8 @@ class Capture:
     def split(self) -> Split:
         """Photos to train on and photos held out, as lists in the folder say, or by the settings' rule.
         Raises UserError if one of the two is empty, or a list names an unknown photo."""
+        if self.known_split is not None:
+            return self.known_split
         train, held_out = self._listed_split() or self._split_by_rule()
         for part, names in (("train", train), ("held-out", held_out)):
             if not names:
@@ -182,6 +188,8 @@ class Capture:
     @cached_property
     def frame(self) -> Frame:
         """Similarity from the file's coordinates to training's."""
+        if self.known_frame is not None:
+            return self.known_frame
         settings = self.settings
         return find_frame(
             self._world_from_camera(self.names), self.reconstruction.points,
