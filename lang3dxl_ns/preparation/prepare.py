@@ -21,6 +21,7 @@ from torch import Tensor
 
 from lang3dxl_ns.common.console import say, some, tracked
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.options import data_option
 from lang3dxl_ns.common.stages import roughly
 from lang3dxl_ns.preparation import workers
 from lang3dxl_ns.preparation.dense_map import (
@@ -46,7 +47,6 @@ from lang3dxl_ns.preparation.model_files import (
     USUAL_CLIP,
     find_model,
     read_config,
-    spoken,
 )
 from lang3dxl_ns.preparation.pyramid import THIRD, Crops, build_clip_target, choose_crops
 from lang3dxl_ns.preparation.regions import RegionSource, label_size, stored_labels
@@ -136,7 +136,7 @@ def prepare(
         if config.clip == BUILTIN:
             say(
                 "Using the built-in CLIP, which knows landmarks and street façades and nothing else. For any "
-                f"word: {spoken(CLIP_OPTION)} {USUAL_CLIP} (a download of 600 MB)"
+                f"word: {data_option('clip')} {USUAL_CLIP} (a download of 600 MB)"
             )
         maker.announce(len(tasks), str(device))
         made = workers.run(config, maker.start, missing, str(device))
@@ -316,7 +316,7 @@ class _Maker:
         if replaced:
             say(
                 f"targets of {replaced} photos were made with other settings, or of other files, and are "
-                f"replaced: {spoken('--pipeline.datamanager.cache-dir')} keeps both"
+                f"replaced: {data_option('cache-dir')} keeps both"
             )
         say(
             f"preparing {len(tasks)} photos ({photos - len(tasks)} of {photos} are ready): "
@@ -342,13 +342,13 @@ class _Maker:
             rest = of_photo * sum(DENSE in task.missing for task in tasks)
         least = (number if task.grids else task.fast for task, number in zip(tasks, encoded, strict=True))
         takes, faster = ((n * of_crop + rest) / config.workers for n in (sum(encoded), sum(least)))
-        quality = spoken("--pipeline.datamanager.quality")
+        quality = data_option("quality")
         hint = "" if faster > 0.9 * takes else f"; {quality} fast: {roughly(faster)}"
         say(f"{len(tasks):,} photos, {sum(encoded):,} crops with {config.clip}: {roughly(takes)}{hint}")
         if device.type == "cpu" and takes > _LONG_S:
             remedies = ["a GPU (some hundred times)", *([f"{quality} fast"] if hint else [])]
             if config.clip != BUILTIN:
-                remedies.append(f"{spoken(CLIP_OPTION)} builtin if its words suffice")
+                remedies.append(f"{data_option('clip')} builtin if its words suffice")
             say(
                 "That is long, since this runs on the CPU. What shortens it: "
                 f"{', '.join([*remedies, 'fewer photos'])}. It can be stopped at any time and goes on where "
