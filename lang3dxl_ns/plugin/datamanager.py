@@ -51,6 +51,7 @@ from lang3dxl_ns.preparation.targets import CLIP, DENSE, FINE, REGIONS, Batch, S
 from lang3dxl_ns.preparation.working_photos import PHOTO_MASKS, PHOTOS, WorkingPhotos
 from lang3dxl_ns.scene.camera import LONGEST_SIDE
 from lang3dxl_ns.scene.colmap import Reconstruction
+from lang3dxl_ns.scene.companions import cache_folder
 from lang3dxl_ns.scene.frame import Frame
 from lang3dxl_ns.scene.photo import Photo
 from lang3dxl_ns.scene.record import SCENE_FILE, ScenePhoto, SceneRecord
@@ -289,7 +290,7 @@ class Lang3DXLDataManager(FullImageDatamanager):
     @property
     def cache_dir(self) -> Path:
         """Folder of prepared targets."""
-        return expanded(self.config.cache_dir or self.data_folder / "lang3dxl_cache")
+        return cache_folder(self.data_folder, self.config.cache_dir)
 
     @cached_property
     def reconstruction(self) -> Reconstruction:
