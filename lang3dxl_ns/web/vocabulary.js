@@ -20,7 +20,7 @@ const WHERE = new RegExp(
 /** Parse prompts, each with negatives: `windows and doors; dome not roof`. Quotes protect a phrase. */
 export function parsePrompts(typed) {
   const held = [], hold = (text) => HELD + (held.push(text) - 1) + HELD;
-  const plain = typed.replace(/‘([^‘’]*)’|[“”„«»]/g, (_, quoted) => (quoted === undefined ? '"' : `"${quoted}"`)).replaceAll("\0", " ");
+  const plain = typed.replace(/‘([^‘’]*)’|[“”„«»]/g, (_, quoted) => (quoted === undefined ? '"' : `"${quoted}"`)).replace(/[\0\s]+/g, " ").trim();
   const restored = (text) => tidy(text.replace(new RegExp(`${HELD}(\\d+)${HELD}`, "g"), (_, i) => held[i]));
   const listed = (text) => text.split(",").flatMap((piece) => piece.split(whole("and"))).filter((part) => part.trim());
   const parts = plain.replace(/"[^"]*"/g, hold).replace(whole("one"), hold).split(";");
