@@ -53,6 +53,7 @@ from lang3dxl_ns.scene.camera import LONGEST_SIDE
 from lang3dxl_ns.scene.colmap import Reconstruction
 from lang3dxl_ns.scene.frame import Frame
 from lang3dxl_ns.scene.photo import Photo
+from lang3dxl_ns.scene.reconstruction import doubtful_photos
 from lang3dxl_ns.scene.record import SCENE_FILE, ScenePhoto, SceneRecord
 from lang3dxl_ns.training.batches import MOST_GONE, read_targets, settle, to_batch
 
@@ -270,7 +271,10 @@ class Lang3DXLDataManager(FullImageDatamanager):
     ) -> list[ScenePhoto]:
         poses, photos = dataset.cameras.camera_to_worlds if poses is None else poses, self.photos
         named = zip((photo.name for photo in dataset.photos), poses.tolist(), strict=True)
-        return [ScenePhoto.of(photos[name], split, pose, dataset.scale) for name, pose in named]
+        doubts = doubtful_photos(self.cache_dir)
+        return [
+            ScenePhoto.of(photos[name], split, pose, dataset.scale, doubts.get(name)) for name, pose in named
+        ]
 
     @property
     def data_folder(self) -> Path:

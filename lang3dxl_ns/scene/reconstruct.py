@@ -39,7 +39,7 @@ from lang3dxl_ns.scene.photo_folder import (
     shared_cameras,
 )
 from lang3dxl_ns.scene.placements import LEAST_MATCHES, doubtful_placements, matched_pairs, rotations_of
-from lang3dxl_ns.scene.reconstruction import ReconstructionReport, ReconstructionSettings
+from lang3dxl_ns.scene.reconstruction import REPORT, ReconstructionReport, ReconstructionSettings
 
 if TYPE_CHECKING:
     import pycolmap
@@ -97,7 +97,7 @@ def reconstruct(
         seconds={stage: round(sum(spent), 1) for stage, spent in clock.items()},
     )  # fmt: skip
     _publish(models, model)
-    replace_file(work / "report.json", json.dumps(asdict(report), indent=2))
+    replace_file(work / REPORT.name, json.dumps(asdict(report), indent=2))
     return report
 
 
@@ -111,7 +111,7 @@ def reconstruct_scene(
     if is_video(data):
         data = extract_frames(data)
     photos = find_photos(data)
-    work = expanded(cache_dir or data / "lang3dxl_cache").absolute() / "reconstruction"
+    work = expanded(cache_dir or data / "lang3dxl_cache").absolute() / REPORT.parent
     model = data / "sparse"
     if not os.access(data, os.W_OK) or (model.exists() and not model_in(model)):
         model = work / "sparse"

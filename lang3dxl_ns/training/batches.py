@@ -31,6 +31,7 @@ from lang3dxl_ns.preparation.targets import Batch, SceneFacts, TargetReader
 from lang3dxl_ns.preparation.working_photos import WorkingPhotos
 from lang3dxl_ns.scene.capture import Capture
 from lang3dxl_ns.scene.photo import Photo
+from lang3dxl_ns.scene.reconstruction import doubtful_photos
 from lang3dxl_ns.scene.record import ScenePhoto, SceneRecord
 from lang3dxl_ns.training.state import PhotoCamera
 
@@ -204,7 +205,11 @@ class TrainingData:
         self, names: Sequence[str], split: Literal["train", "eval"], poses: Tensor
     ) -> list[ScenePhoto]:
         named = zip(names, poses.tolist(), strict=True)
-        return [ScenePhoto.of(self.photos[name], split, pose, self.scale) for name, pose in named]
+        doubts = doubtful_photos(self.cache_dir)
+        return [
+            ScenePhoto.of(self.photos[name], split, pose, self.scale, doubts.get(name))
+            for name, pose in named
+        ]
 
     # ── rounds ──────────────────────────────────────────────────────────────────────────────────────
 
