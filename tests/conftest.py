@@ -108,8 +108,6 @@ def pytest_runtest_teardown() -> None:
                 one.tb_writer.close()
         writer.EVENT_WRITERS.clear()
         writer.EVENT_STORAGE.clear()
-    if models := sys.modules.get("lang3dxl_ns.preparation.model_files"):
-        models.option_prefix.set(models._PREFIX)  # a command that ran in this process spells options its way
 
 
 @pytest.fixture(scope="session")

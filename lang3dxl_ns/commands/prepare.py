@@ -57,11 +57,10 @@ class Prepare(PreparationConfig):
     or dense features with --dense none), and make none."""
 
     def main(self) -> None:
-        from lang3dxl_ns.preparation.model_files import check_encoders, option_prefix
+        from lang3dxl_ns.preparation.model_files import check_encoders
         from lang3dxl_ns.preparation.store import FeatureStore
         from lang3dxl_ns.scene.photo_folder import check_data
 
-        option_prefix.set("--")
         check_data(self.data)
         if not self.clean:
             check_encoders(self.clip, self.dense)
@@ -100,9 +99,7 @@ def _open_datamanager(settings: PreparationConfig, data: Path, cache_dir: Path |
     from lang3dxl_ns.common.device import best_device
     from lang3dxl_ns.plugin.datamanager import Lang3DXLDataManagerConfig
     from lang3dxl_ns.plugin.dataparser import PhotoCollectionDataParserConfig
-    from lang3dxl_ns.preparation.model_files import option_prefix
 
-    option_prefix.set("--")
     config = Lang3DXLDataManagerConfig(
         dataparser=PhotoCollectionDataParserConfig(data=data),
         data=data,

@@ -51,10 +51,8 @@ class Train(SceneSettings, PreparationConfig):
     """Train anew, over the run in the folder."""
 
     def main(self) -> None:
-        from lang3dxl_ns.preparation.model_files import option_prefix
         from lang3dxl_ns.training.fit import Settings, run_folder
 
-        option_prefix.set("--")
         settings = Settings.of(self.method, self.steps)
         for owner, kind in ((settings.scene, SceneSettings), (settings.targets, PreparationConfig)):
             for name, value in _changed(self, kind).items():

@@ -8,6 +8,7 @@ from pathlib import Path, PurePosixPath
 
 from lang3dxl_ns.common.errors import UserError, is_plain
 from lang3dxl_ns.common.files import expanded
+from lang3dxl_ns.common.options import data_option
 
 _LONGEST_NAME = 255
 """Longest file name that file systems allow, in bytes."""
@@ -58,7 +59,7 @@ def named_folder(choice: str, data: Path, option: str) -> Path:
     folder = data / expanded(choice)
     if not folder.is_dir():
         raise UserError(
-            f"--pipeline.datamanager.{option} {choice}: there is no folder {folder}; give an existing one "
+            f"{data_option(option)} {choice}: there is no folder {folder}; give an existing one "
             "(relative to the data folder, or absolute), or one of the choices listed by --help"
         )
     return folder
