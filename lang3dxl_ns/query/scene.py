@@ -516,9 +516,7 @@ class Scene:
         for text in listed:
             if isinstance(text, Tensor | Array):
                 text = Prompt("vector", vector=self._vector(text))
-            if isinstance(text, str) and known_word(text) in self.words:
-                text = Prompt(" ".join(text.split()))
-            for prompt in [text] if isinstance(text, Prompt) else parse_prompts(text):
+            for prompt in [text] if isinstance(text, Prompt) else parse_prompts(text, self.words):
                 word = None if prompt.vector is not None else self.words.get(known_word(prompt.text))
                 prompts.append(prompt if word is None else replace(prompt, taught=word))
         return prompts or parse_prompts("")
