@@ -38,7 +38,13 @@ from lang3dxl_ns.scene.photo_folder import (
     readable,
     shared_cameras,
 )
-from lang3dxl_ns.scene.placements import LEAST_MATCHES, doubtful_placements, matched_pairs, rotations_of
+from lang3dxl_ns.scene.placements import (
+    LEAST_MATCHES,
+    cameras_of,
+    doubtful_placements,
+    matched_pairs,
+    rotations_of,
+)
 from lang3dxl_ns.scene.reconstruction import ReconstructionReport, ReconstructionSettings
 
 if TYPE_CHECKING:
@@ -83,7 +89,7 @@ def reconstruct(
     best, names = models[0], dict(zip(copies.names, good.names, strict=True))
     reasons = _reasons(copies.names, models, features, partners)
     with load_pycolmap().Database.open(database) as db:
-        doubts = doubtful_placements(rotations_of(best), matched_pairs(db, best))
+        doubts = doubtful_placements(rotations_of(best), matched_pairs(db, cameras_of(best)))
     doubtful = {names[best.images[i].name]: why for i, why in sorted(doubts.items())}
     for image in (image for model in models for image in model.images.values()):
         image.name = names[image.name]
