@@ -115,8 +115,8 @@ def trace(
     height: int,
     weathered: bool = False,
 ) -> Traced:
-    """Cast a ray through every pixel's center. The sun decides which recesses are lit. Where weathered, copies
-    of walls and windows have textures of their own."""
+    """Cast a ray through every pixel's center. The sun decides which recesses are lit. Weathered copies of
+    walls and windows have textures of their own."""
     depth, index = cast(shapes, camera, width, height)
     order = np.argsort(index.ravel(), kind="stable")  # radix sort for int16
     pixel = order[np.searchsorted(index.ravel()[order], 0) :]

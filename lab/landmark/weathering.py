@@ -59,7 +59,7 @@ def _hash(copy: Int[Array, " n"], shape: int, kind: int) -> Float[Array, " n"]:
 @cache
 def _noise_table() -> UInt8[Array, "size size size"]:
     """Make smooth periodic noise."""
-    table = np.random.default_rng(21).random((_PERIODS,) * 3, dtype=np.float32)
+    table: np.ndarray = np.random.default_rng(21).random((_PERIODS,) * 3, dtype=np.float32)
     x = np.arange(_PERIODS * _SAMPLES) / _SAMPLES
     i, f = x.astype(int), (x % 1).astype(np.float32)
     f = f * f * (3 - 2 * f)
