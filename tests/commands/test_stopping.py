@@ -3,6 +3,8 @@
 import importlib
 import os
 import signal
+import time
+from typing import Any
 
 import numpy as np
 import pytest
@@ -31,7 +33,31 @@ def stopped(place: str, function: str, number: int, arguments: list[str]) -> Non
     cli.main(arguments)
 
 
-def stop(place: str, function: str, number: signal.Signals, arguments: list[str]) -> None:
+class Finalized:
+    """Object that receives a signal in its finalizer, where Python ignores exceptions."""
+
+    def __del__(self) -> None:
+        os.kill(os.getpid(), signal.SIGTERM)
+        sum(range(100))
+
+
+def stopped_in_a_finalizer(place: str, function: str, _: int, arguments: list[str]) -> None:
+    """A command that receives a signal in a finalizer when it first calls some function."""
+    owner, objects = importlib.import_module(place), [Finalized()]
+    work = getattr(owner, function)
+
+    def finalizing(*arguments, **options):
+        objects.clear()
+        time.sleep(0.5)
+        return work(*arguments, **options)
+
+    setattr(owner, function, finalizing)
+    cli.main(arguments)
+
+
+def stop(
+    place: str, function: str, number: signal.Signals, arguments: list[str], stopped: Any = stopped
+) -> None:
     done = Process(stopped, place, function, int(number), arguments).wait()
     assert done.returncode == 130, done.stderr
     assert "Stopped; finished work is kept." in done.stderr
@@ -80,4 +106,7 @@ def test_a_stopped_evaluation_leaves_the_report_that_was_there(tmp_path):
         signal.SIGINT,
         [*arguments, str(tmp_path / "out")],
     )
+    assert (tmp_path / "out" / "scores.json").read_bytes() == before
+    place = ("lang3dxl_ns.evaluation.predictions", "_read_array")
+    stop(*place, signal.SIGTERM, [*arguments, str(tmp_path / "out")], stopped_in_a_finalizer)
     assert (tmp_path / "out" / "scores.json").read_bytes() == before

@@ -63,6 +63,8 @@ def test_a_word_is_kept_in_the_scene_and_nothing_else_changes(place, capsys):
     assert after.words["gizmo"].examples[0].box == tuple(map(float, DOME.split(",")))
     said = capsys.readouterr().out
     assert "1 example" in said and "average precision" in said and "check it" in said
+    teach(place, "--box", DOME)  # a command that is repeated, such as one that was killed, adds nothing
+    assert len(words(place)["gizmo"].examples) == 1
     teach(place, "--at", "69,69", "--not-at", "20,60")
     assert len(words(place)["gizmo"].examples) == 2
     main(["words", str(place), "--forget", "gizmo/1"])
