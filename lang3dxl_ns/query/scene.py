@@ -510,6 +510,8 @@ class Scene:
     def prompts(self, texts: Text | Sequence[Text]) -> list[Prompt]:
         """Parse prompts, and attach the taught words. Raises UserError if there are no prompts."""
         prompts = list[Prompt]()
+        if isinstance(texts, Array) and texts.dtype.kind in "OU":
+            texts = texts.ravel().tolist()
         listed: Sequence[Any] = texts if isinstance(texts, list | tuple) else [texts]
         for text in listed:
             if isinstance(text, Tensor | Array):

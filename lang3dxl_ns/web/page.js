@@ -1,6 +1,6 @@
 // The page: the search box and its prompts, answers to clicks, words that are taught, and the keys.
 import { element, explain, matched, percent, promptCard, say, shown } from "./cards.js";
-import { Kept, readFields, Steps, written } from "./history.js";
+import { Kept, readFields, Steps, written, MOST_PROMPTS } from "./history.js";
 import { Photos } from "./photos.js";
 import { areExamples, asPython, drawOutline, examplesAsText, examplesFromText, inside, rounded, UNNAMED, wordsFile } from "./teach.js";
 import { thinker } from "./think.js";
@@ -380,14 +380,13 @@ async function apply(hash, turn = drop()) {
   const common = $("not").value !== (wanted.not ?? "");
   $("not").value = wanted.not ?? "";
   try {
-    for (const one of about.words ? wanted.prompts : []) {
-      for (const specified of specify(one)) {
-        const old = common ? null : prompts.find((prompt) => String(Object.values(asField(prompt)).slice(0, 3)) === String(Object.values(asField({ ...specified, color: null })).slice(0, 3)));
-        const prompt = old ?? specified, answered = old ?? (await answer(prompt));
-        if (turn !== cleared) return;
-        if (!answered.known) offerClosest(answered, prompt);
-        else if (!found.includes(prompt)) found.push(Object.assign(prompt, { color: about.colors[one.hue % about.colors.length], open: prompt.text === open }));
-      }
+    const listed = wanted.prompts.flatMap((one) => specify(one).map((specified) => [one, specified]));
+    for (const [one, specified] of about.words ? listed.slice(0, MOST_PROMPTS) : []) {
+      const old = common ? null : prompts.find((prompt) => String(Object.values(asField(prompt)).slice(0, 3)) === String(Object.values(asField({ ...specified, color: null })).slice(0, 3)));
+      const prompt = old ?? specified, answered = old ?? (await answer(prompt));
+      if (turn !== cleared) return;
+      if (!answered.known) offerClosest(answered, prompt);
+      else if (!found.includes(prompt)) found.push(Object.assign(prompt, { color: about.colors[one.hue % about.colors.length], open: prompt.text === open }));
     }
     prompts.splice(0, prompts.length, ...found);
     for (const prompt of found) if (prompt.named) keepWord(prompt);

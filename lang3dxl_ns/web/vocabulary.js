@@ -24,7 +24,7 @@ const WHERE = new RegExp(
  * split. */
 export function parsePrompts(typed, names = []) {
   const held = [], hold = (text) => HELD + (held.push(text) - 1) + HELD;
-  const plain = typed.replace(/‘([^‘’]*)’|[“”„«»]/g, (_, quoted) => (quoted === undefined ? '"' : `"${quoted}"`)).replaceAll("\0", " ");
+  const plain = typed.replace(/‘([^‘’]*)’|[“”„«»]/g, (_, quoted) => (quoted === undefined ? '"' : `"${quoted}"`)).replace(/[\0\s]+/g, " ").trim();
   const restored = (text) => tidy(text.replace(new RegExp(`${HELD}(\\d+)${HELD}`, "g"), (_, i) => held[i]));
   const listed = (text) => text.split(",").flatMap((piece) => piece.split(whole("and"))).filter((part) => part.trim());
   const parts = plain.replace(/"[^"]*"/g, hold).replace(wholeOf([...language.one, ...names.map(tidy).filter(Boolean)].map(literal)), hold).split(";");

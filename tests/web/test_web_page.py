@@ -505,6 +505,15 @@ def test_ask_answers_and_hostile_texts_stay_texts(page):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("text", ["window%3B", "ask=window&ask=", "a" + "%20" * 32_000 + "b", "%22a", "not+"])
+def test_a_link_of_any_length_opens_at_once_with_at_most_twenty_prompts(page, text):
+    page.evaluate(f"location.hash = 'ask=' + {text!r}.repeat({text!r}.length > 99 ? 1 : 10000)")
+    page.wait_for_function("document.querySelectorAll('#prompts > *').length < 21", timeout=5_000)
+    assert page.evaluate("lang3dxl.ask('dome')")["known"]  # the page answers again
+    assert len(prompts_of(page)) <= 21
+
+
+@pytest.mark.slow
 def test_at_the_width_of_a_phone_everything_is_in_reach(browser, address):
     page = opened(browser, address, PHONE)
     page.evaluate("lang3dxl.ask('dome; windows')")
