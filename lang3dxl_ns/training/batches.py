@@ -211,12 +211,12 @@ class TrainingData:
         unrefined)."""
         known = None if self.config.clip == "none" else find_model(self.config.clip, CLIP_OPTION)
         train, frame = self.capture.split.train, self.capture.recorded_frame
-        described, doubts = list[ScenePhoto](), doubtful_photos(self.cache_dir)
+        described, doubts = [], doubtful_photos(self.cache_dir)
         for i, (name, view) in enumerate(self.views.items()):
             pose = view.pose if poses is None or i >= len(train) else poses[i]
             split: Literal["train", "eval"] = "train" if i < len(train) else "eval"
-            photo, doubt = self.photos[name], doubts.get(name)
-            described.append(ScenePhoto.of(photo, split, pose.tolist(), self.scale, doubt))
+            doubt = doubts.get(name)
+            described.append(ScenePhoto.of(self.photos[name], split, pose.tolist(), self.scale, doubt))
         return SceneRecord(
             photos=described,
             clip=None if known is None else known.address,

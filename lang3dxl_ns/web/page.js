@@ -1,6 +1,8 @@
 // The page: the search box and its prompts, answers to clicks, words that are taught, and the keys.
 import { element, explain, matched, percent, promptCard, say, shown } from "./cards.js";
+import { Detail } from "./detail.js";
 import { Kept, readFields, Steps, written, MOST_PROMPTS } from "./history.js";
+import { unpacked } from "./library.js";
 import { Photos } from "./photos.js";
 import { areExamples, asPython, drawOutline, examplesAsText, examplesFromText, inside, rounded, UNNAMED, wordsFile } from "./teach.js";
 import { thinker } from "./think.js";
@@ -24,13 +26,14 @@ const think = thinker(
 const names = () => [...about.names, ...kept.list("words").map(({ name }) => String(name))];
 const commonNegatives = () => $("not").value.split(/[,;]/).map(tidy).filter(Boolean);
 
-/** Answer a prompt anew, with the common negatives. */
+/** Describe a prompt, with the common negatives, for the worker. */
+const question = ({ text, negatives, examples, inScene }) => ({ text, negatives: [...negatives, ...commonNegatives()], examples: inScene ? null : examples });
+
+/** Answer a prompt anew. */
 async function answer(prompt) {
-  const { text, chosen: threshold } = prompt, negatives = [...prompt.negatives, ...commonNegatives()];
-  const examples = prompt.inScene ? null : prompt.examples;
   const turn = (prompt.turn = {}); // a later answer to the same prompt wins
   if (prompt.examples && !prompt.examples.length) return Object.assign(prompt, { known: true, relevancy: null, threshold: null });
-  const found = await think("ask", { text, examples, negatives, threshold });
+  const found = await think("ask", { ...question(prompt), threshold: prompt.chosen });
   if (turn !== prompt.turn || !found.known) return found;
   return Object.assign(prompt, found, { views: null, box: null, finding: null });
 }
@@ -534,15 +537,16 @@ async function chooseLook(photo) {
 /** Show the scene in a photo's lighting. */
 async function light(photo) {
   $("look").value = photo;
-  const colors = photo ? new Uint8Array(await (await fetched(about.looks[photo])).arrayBuffer()) : view.own;
-  if ($("look").value === photo && view.plain !== colors) view.light(colors); // unless a later choice has been read in the meantime
+  const colors = photo ? new Uint8Array(await (await fetched(about.looks[photo])).arrayBuffer()) : view.root.own;
+  if ($("look").value === photo && view.root.plain !== colors) view.light(colors); // unless a later choice has been read in the meantime
 }
 
 function hideFloaters() {
-  if (!view.floats) return;
+  const { floats } = view.root;
+  if (!floats) return;
   const limit = 255 - Math.round(2.55 * Number($("hide").value));
-  view.hide(view.floats, limit);
-  if (about.words) think("hide", { floats: view.floats, limit });
+  view.hide(limit);
+  if (about.words) think("hide", { floats, limit });
 }
 
 // ── start ──
@@ -562,6 +566,7 @@ async function open() {
   $("look").append(...Object.keys(about.looks).map((name) => element("option", { value: name }, name)));
   for (const control of [...$("ask").elements, $("not"), $("teach")]) control.disabled = !about.words;
   const splats = await (await fetched("splats.bin")).arrayBuffer();
+  await unpacked;
   view = new View(about, $("frame"));
   photos = new Photos(about, view, (name) => attempt(() => light(name === null ? chosenLook : name in about.looks ? name : chosenLook)));
   photos.changed = () => keepAddress();
@@ -585,7 +590,7 @@ async function readMeaning(splats) {
 
 /** Read which Gaussians float, once the page answers. */
 async function readFloaters() {
-  view.floats = new Uint8Array(await (await fetched(about.floaters)).arrayBuffer());
+  view.root.floats = new Uint8Array(await (await fetched(about.floaters)).arrayBuffer());
   $("floating").hidden = false;
   hideFloaters();
 }
@@ -603,6 +608,7 @@ async function begin() {
   view.mover.first = location.hash.length > 1 ? null : view.mover.address;
   if (about.words) setTimeout(() => think("space").then(limit)); // behind the prompts
   setTimeout(() => attempt(readFloaters));
+  if (about.detail) new Detail(about, view, think, { read: fetched, question, failed: (error) => say(error.message) });
   if (about.hide) $("hide").value = 50;
   if (location.hash.length > 1) return apply(location.hash, turn);
   for (const [text, ...negatives] of about.prompts) if (turn === cleared) await ask(asTyped({ text, negatives }), turn);

@@ -906,9 +906,17 @@ def test_from_a_folder_it_says_what_it_needs(browser, scene, tmp_path):
 
 def test_a_page_is_complete_and_small(scene):
     files = Page(scene, ["dome; window"]).files()
-    own = {name for name in files if name.endswith((".html", ".css", ".js", ".txt"))}
-    assert {"index.html", "page.css", "page.js", "worker.js", "splats.js", "LICENSES.txt"} <= own
-    assert sum(len(files[name]) for name in own) < 4e6
+    own = {name for name in files if name.endswith((".html", ".css", ".js", ".txt", "spark.bin"))}
+    assert {
+        "index.html",
+        "page.css",
+        "page.js",
+        "worker.js",
+        "library.js",
+        "spark.bin",
+        "LICENSES.txt",
+    } <= own
+    assert sum(len(files[name]) for name in own) < 1.4e6
     licenses = files["LICENSES.txt"].decode()
     assert all(name in licenses for name in ("three 0", "spark 2", "fflate 0", "MIT License"))
     assert json.loads(files["scene.json"])["prompts"] == [["dome"], ["window"]]
