@@ -1,7 +1,7 @@
 // The page: the search box and its prompts, answers to clicks, words that are taught, and the keys.
 import { element, explain, matched, percent, promptCard, say, shown } from "./cards.js";
 import { Detail } from "./detail.js";
-import { Kept, readFields, Steps, written } from "./history.js";
+import { Kept, readFields, Steps, written, MOST_PROMPTS } from "./history.js";
 import { unpacked } from "./library.js";
 import { Photos } from "./photos.js";
 import { areExamples, asPython, drawOutline, examplesAsText, examplesFromText, inside, rounded, UNNAMED, wordsFile } from "./teach.js";
@@ -22,6 +22,8 @@ const think = thinker(
 
 // ── asking ──
 
+/** Names that hold words such as *and*, which separate prompts elsewhere. */
+const names = () => [...about.names, ...kept.list("words").map(({ name }) => String(name))];
 const commonNegatives = () => $("not").value.split(/[,;]/).map(tidy).filter(Boolean);
 
 /** Describe a prompt, with the common negatives, for the worker. */
@@ -74,7 +76,7 @@ async function ask(typed, turn = cleared) {
   await reading;
   quiet();
   let found = null;
-  for (const { text, negatives } of about.words ? parsePrompts(String(typed)) : []) {
+  for (const { text, negatives } of about.words ? parsePrompts(String(typed), names()) : []) {
     const word = namedWord(text) ?? { text };
     const same = () => prompts.find((prompt) => prompt.text === word.text && String(prompt.negatives) === String(negatives));
     const old = same(), prompt = old ?? { negatives, ...word };
@@ -88,6 +90,7 @@ async function ask(typed, turn = cleared) {
     if (!card.color) add(card);
     kept.store("prompts", [text, ...kept.list("prompts").filter((other) => other !== text)]);
     draw(settled ? card : null);
+    if (found.meant && found.trust.level !== "sure") offerMeant(found.meant, card);
   }
   const { known = false, doubtful = true, threshold = null, peak = 0, matching = 0 } = found ?? {};
   return { known, doubtful, threshold, peak, matching };
@@ -95,6 +98,12 @@ async function ask(typed, turn = cleared) {
 
 function add(prompt) {
   prompts.push(Object.assign(prompt, { color: unusedColor() }));
+}
+
+/** Offer the word that a misspelled one most likely means; a click puts it in its place. */
+function offerMeant(meant, prompt) {
+  const mend = () => (prompts.includes(prompt) && remove(prompt), ask(asTyped({ text: meant, negatives: prompt.negatives })));
+  $("near").replaceChildren("Did you mean ", choice(meant, mend), "?");
 }
 
 /** Offer the words closest to an unknown one; a click puts a word in its place, in the prompt and in "But not". */
@@ -374,14 +383,13 @@ async function apply(hash, turn = drop()) {
   const common = $("not").value !== (wanted.not ?? "");
   $("not").value = wanted.not ?? "";
   try {
-    for (const one of about.words ? wanted.prompts : []) {
-      for (const specified of specify(one)) {
-        const old = common ? null : prompts.find((prompt) => String(Object.values(asField(prompt)).slice(0, 3)) === String(Object.values(asField({ ...specified, color: null })).slice(0, 3)));
-        const prompt = old ?? specified, answered = old ?? (await answer(prompt));
-        if (turn !== cleared) return;
-        if (!answered.known) offerClosest(answered, prompt);
-        else if (!found.includes(prompt)) found.push(Object.assign(prompt, { color: about.colors[one.hue % about.colors.length], open: prompt.text === open }));
-      }
+    const listed = wanted.prompts.flatMap((one) => specify(one).map((specified) => [one, specified]));
+    for (const [one, specified] of about.words ? listed.slice(0, MOST_PROMPTS) : []) {
+      const old = common ? null : prompts.find((prompt) => String(Object.values(asField(prompt)).slice(0, 3)) === String(Object.values(asField({ ...specified, color: null })).slice(0, 3)));
+      const prompt = old ?? specified, answered = old ?? (await answer(prompt));
+      if (turn !== cleared) return;
+      if (!answered.known) offerClosest(answered, prompt);
+      else if (!found.includes(prompt)) found.push(Object.assign(prompt, { color: about.colors[one.hue % about.colors.length], open: prompt.text === open }));
     }
     prompts.splice(0, prompts.length, ...found);
     for (const prompt of found) if (prompt.named) keepWord(prompt);
@@ -394,7 +402,7 @@ async function apply(hash, turn = drop()) {
 
 /** Read a prompt of an address: { kind, text, at } as prompts without answers. */
 function specify({ kind, text, at }) {
-  if (kind === "ask") return parsePrompts(text).map((prompt) => ({ ...prompt, ...(at !== undefined && { chosen: at }) }));
+  if (kind === "ask") return parsePrompts(text, names()).map((prompt) => ({ ...prompt, ...(at !== undefined && { chosen: at }) }));
   const read = examplesFromText(text, about);
   if (!read || !tidy(read.name)) return [];
   return [{ text: tidy(read.name), negatives: [], examples: read.examples, named: !UNNAMED.test(read.name), ...(at !== undefined && { chosen: at }) }];
@@ -412,13 +420,14 @@ function settle(hash = null) {
 async function offer() {
   const typed = $("word").value.split(";").at(-1), before = $("word").value.slice(0, $("word").value.length - typed.length);
   const own = kept.list("words").map(({ name }) => String(name)), start = tidy(typed).toLowerCase(), offered = await think("offered", { typed });
-  const words = start ? [...own.filter((name) => name.toLowerCase().includes(start)), ...offered] : [...own, ...kept.list("prompts").map(String), ...offered];
+  const words = start ? [...own.filter((name) => name.toLowerCase().includes(start)), ...offered] : [...own, ...about.suggested, ...kept.list("prompts").map(String), ...offered];
   $("offered").replaceChildren(...[...new Set(words)].map((word) => element("option", { value: before + word })));
 }
 
 /** Suggest words to a visitor who has asked nothing yet. */
 async function suggest() {
-  const words = [...new Set([...kept.list("words").map(({ name }) => String(name)), ...(about.suggested ?? (await think("offered", { typed: "" })))])];
+  const known = about.suggested.length ? about.suggested : await think("offered", { typed: "" });
+  const words = [...new Set([...kept.list("words").map(({ name }) => String(name)), ...known])];
   $("try").replaceChildren("Try: ", ...words.slice(0, MOST_TRIED).map((word) => choice(word, () => ask(word))));
 }
 

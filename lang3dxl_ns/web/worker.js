@@ -107,7 +107,7 @@ const jobs = {
     if (examples) return { known: true, ...answers.verdict(likeness(answers.rows, examples), { strict: true, doubt: 0, threshold }) };
     const { found, unknown } = await understood([text, ...negatives]);
     if (unknown !== undefined) return { known: false, unknown, closest: vocabulary.closest(unknown) };
-    return { known: true, taught: Boolean(found[0].taught), ...judged(found, threshold) };
+    return { known: true, taught: Boolean(found[0].taught), meant: found[0].meant, ...judged(found, threshold) };
   },
 
   /** Read a chunk of more detail: splats, floaters, and codes or rows. */

@@ -25,14 +25,14 @@ from lang3dxl_ns.files.scene_file import Provenance
 from lang3dxl_ns.query import view_ranking
 from lang3dxl_ns.query.doubt import BEST, DOUBTFUL, DOUBTFUL_TAUGHT, LEAST_PEAK
 from lang3dxl_ns.query.heat_maps import PROMPT_COLORS
-from lang3dxl_ns.query.language import TABLE
+from lang3dxl_ns.query.language import TABLE, phrases_of
 from lang3dxl_ns.query.negatives import CLEAR, NOTHING, competitors
 from lang3dxl_ns.query.scene import NO_SEMANTICS, Scene
 from lang3dxl_ns.query.text import Prompt, tidy
 from lang3dxl_ns.query.thresholds import EVEN, SHARE
 from lang3dxl_ns.query.trust import ALIKE, ANCHORS, CLEARLY, FAINT, FAR, STRICTER, STRICTEST
 from lang3dxl_ns.query.visibility import spread
-from lang3dxl_ns.query.vocabulary import common_words, same_thing, shipped_vocabulary
+from lang3dxl_ns.query.vocabulary import closest_word, common_words, same_thing, shipped_vocabulary
 from lang3dxl_ns.web.levels import MOST_ROWS, SMALL, Levels, levels_of
 from lang3dxl_ns.web.pack import (
     LEAST_PIXELS,
@@ -64,6 +64,11 @@ _RULES = {
     **{"clearly": CLEARLY, "stricter": STRICTER, "strictest": STRICTEST, "far": FAR},
 }
 """Numbers that decide what matches, what is doubtful and what a place is called, for the page's answers."""
+_SUGGESTED = (
+    "windows", "doors", "towers", "spires", "domes", "minarets", "roof", "arches", "columns", "balconies",
+    "statues", "stairs", "chimneys", "clock", "trees", "cars", "grass",
+)  # fmt: skip
+"""Words that a first visitor is offered, where the scene knows them."""
 _RANKING = ("PEAK", "LARGE", "RIM", "STRONG", "CORE", "JOINED", "OUTLIERS", "DENSE")
 _TEXTS = 256
 """Number of texts encoded at a time."""
@@ -183,9 +188,24 @@ class Page:
                 for name in views
             ]
             about["foreground"] = _phrases(self._foreground)
+            named = _distinct([*(word.name for word in scene.words.values()), *self.words, *self.more])
+            several = filter(re.compile(r"[\s,]").search, named)
+            about["names"] = [name for name in several if phrases_of(name) != [(name, [])]]
+            about["suggested"] = self._suggested()
         about["left_out"] = self.left_out
         files["scene.json"] = json.dumps(about).encode()
         return files
+
+    def _suggested(self) -> list[str]:
+        """List words that the scene answers surely, each with matches of its own: taught ones come first."""
+        words = [*(word.name for word in self.scene.words.values()), *_SUGGESTED]
+        question, chosen = self.scene.ask([Prompt(word) for word in words]), list[int]()
+        for row, (trust, own) in enumerate(zip(question.trusts, question.gaussians, strict=True)):
+            others = question.gaussians[chosen]
+            same = (own & others).sum(1) > ALIKE * (own | others).sum(1)
+            if trust.level == "sure" and bool(own.any()) and not bool(same.any()):
+                chosen.append(row)
+        return [words[row] for row in chosen]
 
     def _chunks(self, levels: Levels, center: Float[Tensor, "3"]) -> dict[str, bytes]:
         """Pack the chunks that show more detail: splats, floaters, and what the Gaussians mean."""
@@ -281,7 +301,8 @@ class Page:
         near, against = self._meant(self._meaning, text)
         vector = self.scene.text.vectors([text]).to(self.scene.device)
         own = self._meaning.of_texts(vector)[0].tolist()
-        told: dict[str, Any] = {"own": own, "near": near.tolist(), "against": against}
+        meant = closest_word(text, (*self.scene.words, *common_words()))
+        told: dict[str, Any] = {"own": own, "near": near.tolist(), "against": against, "meant": meant}
         known = self.scene.words.get(known_word(text))
         return told if known is None else told | {"taught": self._taught(self._meaning, known)}
 
