@@ -28,6 +28,7 @@ from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.query.text import taught_prompt
 from lang3dxl_ns.rendering import Splats
 from lang3dxl_ns.scene.capture import Capture, open_capture
+from lang3dxl_ns.scene.companions import cache_folder
 from lang3dxl_ns.scene.photo_folder import check_data
 
 _LIGHT = 0.15
@@ -98,7 +99,7 @@ def attach(
             collection = open_capture(data)
             similarity = _frame(splats, collection, path, place)
     with stages.stage("prepare"):
-        cache = expanded(config.cache_dir or collection.folder / "lang3dxl_cache")
+        cache = cache_folder(collection.folder, config.cache_dir)
         collection, targets = prepare_photos(collection, preparation, cache, worker)
     tracked = collection.reconstruction.photos
     cameras = {

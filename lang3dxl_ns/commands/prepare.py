@@ -98,6 +98,7 @@ def _opened(settings: PreparationConfig, data: Path, cache_dir: Path | None) -> 
     """Open a folder of photos with these settings. Nothing is prepared yet."""
     from lang3dxl_ns.common.device import best_device
     from lang3dxl_ns.scene.capture import open_capture, say_left_out
+    from lang3dxl_ns.scene.companions import cache_folder
     from lang3dxl_ns.training.batches import TrainingData, settle
 
     settings.check()
@@ -106,6 +107,4 @@ def _opened(settings: PreparationConfig, data: Path, cache_dir: Path | None) -> 
     learned = settings.crops == "pyramid" or settings.regions not in ("auto", "none")
     config = PreparationConfig(**{f.name: getattr(settings, f.name) for f in fields(PreparationConfig)})
     settle(config, learned, gathered=not learned)
-    return TrainingData(
-        capture, config, cache_dir or capture.folder / "lang3dxl_cache", best_device(), learned
-    )
+    return TrainingData(capture, config, cache_folder(capture.folder, cache_dir), best_device(), learned)

@@ -20,7 +20,6 @@ from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from lang3dxl_ns.common.checks import check_numbers
 from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.common.files import expanded
 from lang3dxl_ns.common.reports import part
 from lang3dxl_ns.common.settings_help import showing, without
 from lang3dxl_ns.plugin.cameras import to_cameras
@@ -40,6 +39,7 @@ from lang3dxl_ns.preparation.targets import Batch, SceneFacts
 from lang3dxl_ns.preparation.working_photos import WorkingPhotos
 from lang3dxl_ns.scene.camera import LONGEST_SIDE
 from lang3dxl_ns.scene.capture import Capture
+from lang3dxl_ns.scene.companions import cache_folder
 from lang3dxl_ns.scene.record import SCENE_FILE, SceneRecord
 from lang3dxl_ns.training.batches import TrainingData, settle
 from lang3dxl_ns.training.state import PhotoCamera
@@ -136,7 +136,7 @@ class Lang3DXLDataManager(FullImageDatamanager):
         """Open the photos, and build the dataset of training photos, with facts for the model."""
         config, capture = self.config, self._capture()
         self.data = TrainingData(
-            capture, config, expanded(config.cache_dir or capture.folder / "lang3dxl_cache"), self.device,
+            capture, config, cache_folder(capture.folder, config.cache_dir), self.device,
             config.targets_in_steps, config.camera_res_scale_factor, config.cache_gb, config.read_ahead,
             config.train_cameras_sampling_seed,
         )  # fmt: skip

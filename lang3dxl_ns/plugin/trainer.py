@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch
+from nerfstudio.engine.callbacks import TrainingCallbackLocation
 from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.engine.trainer import Trainer
 from nerfstudio.utils import writer
@@ -361,7 +362,14 @@ class Lang3DXLTrainer(Trainer):
         if self.interrupted:
             self.config.viewer.quit_on_train_completion = True
             CONSOLE.print(self._how_to_resume(self.step), soft_wrap=True)
-        super()._after_train()  # saves first
+        # As nerfstudio's own, but its tables come before the lines that say what to do next.
+        self.training_state = "completed"
+        writer.write_out_storage()
+        self.save_checkpoint(self.step)
+        for callback in self.callbacks:
+            callback.run_callback_at_location(self.step, TrainingCallbackLocation.AFTER_TRAIN)
+        if not self.config.viewer.quit_on_train_completion:
+            self._train_complete_viewer()
 
     def write_scene(self) -> None:
         """Write the trained scene as one file into the run's folder, for queries and sharing. It keeps the

@@ -63,3 +63,15 @@ def named_folder(choice: str, data: Path, option: str) -> Path:
             "(relative to the data folder, or absolute), or one of the choices listed by --help"
         )
     return folder
+
+
+def cache_folder(data: Path, named: Path | None) -> Path:
+    """Return the folder of prepared targets: the named one, or lang3dxl_cache in the photos' folder. Raises
+    UserError if the latter is a link: who made that folder would choose which files are written over."""
+    if named is not None:
+        return expanded(named)
+    folder = data / "lang3dxl_cache"
+    if folder.is_symlink():
+        instead = f"{data_option('cache-dir')} {os.path.realpath(folder)}"
+        raise UserError(f"{folder} is a link: remove it, or if it is yours, add {instead}")
+    return folder

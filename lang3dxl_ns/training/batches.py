@@ -32,6 +32,7 @@ from lang3dxl_ns.preparation.targets import CLIP, DENSE, FINE, REGIONS, Batch, S
 from lang3dxl_ns.preparation.working_photos import PHOTO_MASKS, PHOTOS, WorkingPhotos
 from lang3dxl_ns.scene.capture import Capture
 from lang3dxl_ns.scene.photo import Photo
+from lang3dxl_ns.scene.reconstruction import doubtful_photos
 from lang3dxl_ns.scene.record import ScenePhoto, SceneRecord
 from lang3dxl_ns.training.state import PhotoCamera
 
@@ -210,11 +211,12 @@ class TrainingData:
         unrefined)."""
         known = None if self.config.clip == "none" else find_model(self.config.clip, CLIP_OPTION)
         train, frame = self.capture.split.train, self.capture.recorded_frame
-        described = []
+        described, doubts = [], doubtful_photos(self.cache_dir)
         for i, (name, view) in enumerate(self.views.items()):
             pose = view.pose if poses is None or i >= len(train) else poses[i]
             split: Literal["train", "eval"] = "train" if i < len(train) else "eval"
-            described.append(ScenePhoto.of(self.photos[name], split, pose.tolist(), self.scale))
+            doubt = doubts.get(name)
+            described.append(ScenePhoto.of(self.photos[name], split, pose.tolist(), self.scale, doubt))
         return SceneRecord(
             photos=described,
             clip=None if known is None else known.address,

@@ -25,6 +25,7 @@ from lang3dxl_ns.preparation.needs import needs_table
 from lang3dxl_ns.preparation.settings import PreparationConfig
 from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.scene.capture import Capture, open_capture, say_left_out
+from lang3dxl_ns.scene.companions import cache_folder
 from lang3dxl_ns.scene.photo_folder import check_data
 from lang3dxl_ns.training.batches import TrainingData, settle
 from lang3dxl_ns.training.checkpoint import CHECKPOINT, read_checkpoint, save_checkpoint
@@ -304,7 +305,7 @@ def run_folder(
     folder = Path("outputs") / (capture.folder.name or "scene") if out is None else expanded(out)
     if restart:
         (folder / CHECKPOINT).unlink(missing_ok=True)
-    cache = expanded(cache_dir or capture.folder / "lang3dxl_cache")
+    cache = cache_folder(capture.folder, cache_dir)
     return folder, fit(capture, settings, folder, cache)
 
 

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.plugin.datamanager import Lang3DXLDataManagerConfig
 from lang3dxl_ns.plugin.dataparser import PhotoCollectionDataParserConfig, parser_for
-from lang3dxl_ns.scene.capture import images_path
+from lang3dxl_ns.scene.layout import images_folder
 from lang3dxl_ns.scene.photo_folder import _sharpest, extract_frames
 
 needs_ffmpeg = pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="ffmpeg is not installed")
@@ -182,7 +182,7 @@ def test_an_empty_images_folder_does_not_hide_the_photos(walk, tmp_path):
     data = shutil.copytree(walk, tmp_path / "data")
     (data / "images").mkdir()
     (data / "images" / ".DS_Store").touch()
-    assert images_path(data) == Path(".")
+    assert images_folder(data, data / "sparse" / "0") == data
 
 
 @needs_ffmpeg
