@@ -174,8 +174,8 @@ def threshold(answers: Sequence[Judged]) -> float:
     levels = np.linspace(FAINT, 1, 101)
     right, wrong = [a for a in answers if a.right], [a for a in answers if a.wrong]
     merit = [
-        np.mean([a.cautioned_at(x) for a in wrong] or [0])
-        - np.mean([a.cautioned_at(x) for a in right] or [0])
+        np.mean([a.cautioned_at(x) for a in wrong] or [False])
+        - np.mean([a.cautioned_at(x) for a in right] or [False])
         for x in levels
     ]
     return float(np.median(levels[np.isclose(merit, max(merit))]))

@@ -44,6 +44,8 @@ class ReconstructionReport:
     """Mean reprojection error in pixels."""
     cameras: int
     mapper: str
+    contradicting: int = 0
+    """Pairs of photos that match, but contradict others and were left out."""
     left_out: dict[str, str] = field(default_factory=dict)
     """Photos without a pose, with reasons."""
     doubtful: dict[str, str] = field(default_factory=dict)
@@ -66,6 +68,11 @@ class ReconstructionReport:
                 f"the photos fall into {len(self.other_models) + 1} unconnected groups: the "
                 f"largest, of {self.registered}, is used; the others have {sizes}. Add photos that connect "
                 "them, or give each group its own folder"
+            )
+        if self.contradicting:
+            found.append(
+                f"{self.contradicting} pairs of photos match but contradict others, as different sides that "
+                "look alike do: they were left out"
             )
         for what, photos in (("doubtfully placed", self.doubtful), ("left out", self.left_out)):
             reasons: dict[str, list[str]] = {}
