@@ -345,7 +345,7 @@ def test_a_conversation_in_the_viewer(default, gpu):
     model = pipeline.model.eval()
     with gpu():
         session = Conversation(
-            model, pipeline.scene_file, default.base_dir, nullcontext(), lambda: False, lambda: None,
+            model.run, pipeline.scene_file, default.base_dir, nullcontext(), lambda: False, lambda: None,
             lambda: {"rgb"}, lambda _: None,
         )  # fmt: skip
         session.ask("tower")

@@ -9,14 +9,14 @@ import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
 import torch
 from nerfstudio.engine.callbacks import TrainingCallbackLocation
 from nerfstudio.engine.optimizers import Optimizers
-from nerfstudio.engine.trainer import Trainer
+from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils import writer
 from nerfstudio.utils.decorators import check_main_thread
 from nerfstudio.utils.rich_utils import CONSOLE
@@ -33,7 +33,7 @@ from lang3dxl_ns.common.stages import Stages
 from lang3dxl_ns.common.stopping import stoppable
 from lang3dxl_ns.files.scene_file import SUFFIX, Provenance, replace_scene
 from lang3dxl_ns.plugin.optimizers import GuardedOptimizers
-from lang3dxl_ns.plugin.pipeline import Lang3DXLPipeline
+from lang3dxl_ns.plugin.pipeline import Lang3DXLPipeline, Lang3DXLPipelineConfig
 from lang3dxl_ns.plugin.run_checkpoint import NOT_A_CHECKPOINT, check_checkpoint, read_checkpoint
 from lang3dxl_ns.preparation.needs import NEEDS_FILE, write_needs
 from lang3dxl_ns.preparation.store import PhotosGoneError
@@ -78,7 +78,16 @@ def _disk_kept_out_of_training() -> Iterator[None]:
         writer.write_out_storage, threading.excepthook = write, ends_badly
 
 
-def requested_checkpoint(config: Any) -> Path | None:
+@dataclass
+class RunConfig(TrainerConfig):
+    """Settings that the trainer reads; `Lang3DXLTrainerConfig` fits them to a run."""
+
+    pipeline: Lang3DXLPipelineConfig = field(default_factory=Lang3DXLPipelineConfig)
+    max_skipped_steps: int = 20
+    """Most steps in a row that are skipped, because loss or gradient is not finite, before the run stops."""
+
+
+def requested_checkpoint(config: TrainerConfig) -> Path | None:
     """Find the checkpoint that a run's settings resume. Raises UserError if it doesn't exist."""
     folder, path = config.load_dir, config.load_checkpoint
     if folder is not None:
@@ -95,8 +104,7 @@ class Lang3DXLTrainer(Trainer):
     """nerfstudio's trainer with atomic checkpoints, resumed runs that end at the requested iteration, and a
     guard against steps that are not finite."""
 
-    config: Any
-    """Settings of the run, a `Lang3DXLTrainerConfig`; that class's module imports this one."""
+    config: RunConfig
     pipeline: Lang3DXLPipeline
     optimizers: GuardedOptimizers
     stages: Stages
@@ -110,7 +118,7 @@ class Lang3DXLTrainer(Trainer):
     _is_ending = False
     _run_state: dict[str, Any] | None = None
 
-    def __init__(self, config: Any, local_rank: int = 0, world_size: int = 1) -> None:
+    def __init__(self, config: RunConfig, local_rank: int = 0, world_size: int = 1) -> None:
         """Set up mixed precision: bfloat16 where the hardware has it. Its range is float32's, so gradients
         need no scale, and no step is lost or waits for one. Older GPUs (before Ampere) use float16 with a
         scale. Raises UserError for a CPU without bfloat16, on which nerfstudio would ignore the setting."""

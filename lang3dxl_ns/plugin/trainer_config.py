@@ -20,10 +20,10 @@ from lang3dxl_ns.files.runs import find_config
 from lang3dxl_ns.plugin.dataparser import PhotoCollectionDataParserConfig
 from lang3dxl_ns.plugin.inert_settings import check_inert
 from lang3dxl_ns.plugin.optimizers import RunAdamConfig, RunScheduleConfig
-from lang3dxl_ns.plugin.pipeline import Lang3DXLPipeline, Lang3DXLPipelineConfig, print_user_errors_plainly
+from lang3dxl_ns.plugin.pipeline import Lang3DXLPipeline, print_user_errors_plainly
 from lang3dxl_ns.plugin.run_checkpoint import check_checkpoint, latest_checkpoint
 from lang3dxl_ns.plugin.run_settings import load_configs, no_config, read_settings
-from lang3dxl_ns.plugin.trainer import Lang3DXLTrainer, requested_checkpoint
+from lang3dxl_ns.plugin.trainer import Lang3DXLTrainer, RunConfig, requested_checkpoint
 from lang3dxl_ns.plugin.viewer_guard import ONLY_HERE
 from lang3dxl_ns.preparation.model_files import BUILTIN, check_encoders
 from lang3dxl_ns.preparation.needs import read_needs
@@ -41,13 +41,10 @@ _OF_SCHEDULES = {**dict.fromkeys(("start", "end", "until"), (1e-9, 1e9)), "warm"
     *("machine", "viewer", "pipeline"),
 )
 @dataclass
-class Lang3DXLTrainerConfig(TrainerConfig):
+class Lang3DXLTrainerConfig(RunConfig):
     """Settings of a training run. `--max-num-iterations` alone rescales every schedule."""
 
     _target: type = field(default_factory=lambda: Lang3DXLTrainer)
-    pipeline: Lang3DXLPipelineConfig = field(default_factory=Lang3DXLPipelineConfig)
-    max_skipped_steps: int = 20
-    """Most steps in a row that are skipped, because loss or gradient is not finite, before the run stops."""
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Restore settings from config.yml, and tell the data manager the run's folder, known only here."""
