@@ -28,6 +28,7 @@ from lang3dxl_ns.common.memory import machine_memory
 from lang3dxl_ns.common.pictures import open_picture
 from lang3dxl_ns.common.reports import measure, part
 from lang3dxl_ns.scene.colmap import load_pycolmap
+from lang3dxl_ns.scene.companions import cache_folder
 from lang3dxl_ns.scene.learned_features import extract_learned, features_for, match_learned
 from lang3dxl_ns.scene.pairing import pairs_to_match
 from lang3dxl_ns.scene.photo_folder import (
@@ -45,7 +46,7 @@ from lang3dxl_ns.scene.placements import (
     matched_pairs,
     rotations_of,
 )
-from lang3dxl_ns.scene.reconstruction import ReconstructionReport, ReconstructionSettings
+from lang3dxl_ns.scene.reconstruction import REPORT, ReconstructionReport, ReconstructionSettings
 from lang3dxl_ns.scene.symmetry import without_contradictions
 
 if TYPE_CHECKING:
@@ -106,7 +107,7 @@ def reconstruct(
         seconds={stage: round(sum(spent), 1) for stage, spent in clock.items()},
     )  # fmt: skip
     _publish(models, model)
-    replace_file(work / "report.json", json.dumps(asdict(report), indent=2))
+    replace_file(work / REPORT.name, json.dumps(asdict(report), indent=2))
     return report
 
 
@@ -120,7 +121,7 @@ def reconstruct_scene(
     if is_video(data):
         data = extract_frames(data)
     photos = find_photos(data)
-    work = expanded(cache_dir or data / "lang3dxl_cache").absolute() / "reconstruction"
+    work = cache_folder(data, cache_dir).absolute() / REPORT.parent
     model = data / "sparse"
     if not os.access(data, os.W_OK) or (model.exists() and not model_in(model)):
         model = work / "sparse"

@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Literal
 
 from lang3dxl_ns.common.console import some
+from lang3dxl_ns.common.errors import DAMAGE
+from lang3dxl_ns.common.files import read_json
+
+REPORT = Path("reconstruction/report.json")
+"""File of the report in a scene's cache."""
 
 
 @dataclass
@@ -78,3 +85,10 @@ class ReconstructionReport:
                 "doubtful ones in the viewer, and remove those that stand wrong"
             )
         return found
+
+
+def doubtful_photos(cache_dir: Path) -> dict[str, str]:
+    """Read from a scene's cache which photos were doubtfully placed, with reasons; none without a report."""
+    with suppress(*DAMAGE):
+        return {str(name): str(why) for name, why in read_json(cache_dir / REPORT)["doubtful"].items()}
+    return {}
