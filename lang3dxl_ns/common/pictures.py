@@ -24,7 +24,7 @@ _EXTRA = ("JXL",)
 """Formats that are accepted if a plugin of Pillow for them is installed."""
 PHOTO_SUFFIXES = (
     *(".jpg", ".jpeg", ".jfif", ".jpe", ".png", ".webp", ".tif", ".tiff", ".bmp", ".gif", ".avif"),
-    *(".heic", ".heif", ".hif", ".jxl"),
+    *(".heic", ".heif", ".hif", ".jxl", ".mpo"),
 )
 RAW_SUFFIXES = (
     *(".dng", ".cr2", ".cr3", ".crw", ".nef", ".nrw", ".arw", ".srf", ".sr2", ".raf", ".orf", ".rw2", ".pef"),
