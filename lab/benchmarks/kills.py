@@ -108,9 +108,8 @@ def trial(
         said = done.stdout + done.stderr
         if re.search(WHOLE, said):
             break
-        if "Traceback" in said or (
-            number is not signal.SIGKILL and done.returncode not in (0, 130, 143, -2, -15)
-        ):
+        stopped = done.returncode in (0, 130, 143, -2, -15) or number is signal.SIGKILL
+        if "Traceback" in said or not stopped:
             faults.append(f"{number.name} at {moment:.1f} s: ends with {done.returncode}: {said[-1500:]}")
         faults += [f"{number.name} at {moment:.1f} s: {what}" for what in lost(folder, given, case)]
     done = processes.run(*case.words, *case.resumed(folder), cwd=folder, timeout=300)

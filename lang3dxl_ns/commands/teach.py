@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -55,9 +55,7 @@ class Teach:
         with file_locked(file):  # another example that is taught at this moment comes first, or waits
             scene = load_scene(file, clip=self.clip)
             before = scene.words[name].examples if name in scene.words else ()
-            told = replace(example, photo=scene.file.photo(example.photo).name).to_json()
-            known = any(one.to_json() == told for one in before)  # this command was run before
-            taught = scene.teach(self.word, [*before, *([] if known else [example])])
+            taught = scene.teach(self.word, [*before, example])
             keep_words(file, {name: taught.words[name]})
         say(*described(taught.words[name]))
         say(f"  least sure in {taught.unsure(self.word)}: check it, and mark it next")

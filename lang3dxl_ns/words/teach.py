@@ -27,8 +27,10 @@ def learned_word(
     prompt = taught_prompt(word)
     photos = [scene.file.photo(example.photo) for example in examples]
     listed = [replace(e, photo=p.name, size=p.file_size) for e, p in zip(examples, photos, strict=True)]
-    pairs = zip(listed, photos, strict=True)
-    weights = [Weights.of(example, photo, scene.splats, scene.backend) for example, photo in pairs]
+    # A command that is repeated, such as one that was killed, teaches nothing twice.
+    pairs = {str(example.to_json()): (example, photo) for example, photo in zip(listed, photos, strict=True)}
+    listed = [example for example, _ in pairs.values()]
+    weights = [Weights.of(example, photo, scene.splats, scene.backend) for example, photo in pairs.values()]
     if selection is not None:
         selection = torch.as_tensor(selection, device=scene.device)
         weights = [Weights(w.seen * selection, torch.zeros_like(w.seen), w.seen) for w in weights]
