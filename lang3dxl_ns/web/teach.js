@@ -64,8 +64,7 @@ export function areExamples(examples, count) {
 
 // ── marks as Python's examples ──
 
-/** Collect marks photo by photo as `Example.to_json` writes them. Photos where only counterexamples are marked are left
- * out: an example needs what is meant. */
+/** Collect marks photo by photo as `Example.to_json` writes them. */
 export function asPython(examples, cameras) {
   const photos = new Map();
   for (const example of examples.filter(({ photo }) => photo !== undefined)) {
@@ -75,9 +74,7 @@ export function asPython(examples, cameras) {
     if (example.outline && !example.without) found.outlines.push(file(example.outline));
     else found[example.without ? "not_points" : "points"].push(...pixels(example.outline ? inside(example.outline) : example.points));
   }
-  return [...photos.values()]
-    .map(({ outlines, ...rest }) => ({ ...rest, ...(outlines.length && { mask: maskOf(outlines, rest.size) }) }))
-    .filter(({ points, mask }) => points.length || mask);
+  return [...photos.values()].map(({ outlines, ...rest }) => ({ ...rest, ...(outlines.length && { mask: maskOf(outlines, rest.size) }) }));
 }
 
 /** Draw outlines (pixels of a file of this size) as a mask, in run lengths column by column, outside first. */

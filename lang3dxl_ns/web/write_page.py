@@ -153,6 +153,8 @@ class Page:
             "live": self.live,
             "prompts": _phrases(self.prompts),
             "words": None,
+            "names": [],
+            "suggested": [],
         }
         if self.levels is not None:
             files |= self._chunks(self.levels, center)

@@ -73,9 +73,12 @@ class Weights:
 
     @property
     def rest(self) -> Float[Tensor, " n"]:
-        """Shares of what is not the word. Pixels marked as something else weigh as much as all others."""
+        """Shares of what is not the word. Pixels marked as something else weigh as much as all others, and
+        count alone where nothing is marked as the word, which may be among the others."""
         rest = (self.seen - self.word).clamp_min(0).double()
         rest, marked = rest / rest.sum().clamp_min(1e-12), self.other.double()
+        if float(self.word.sum()) <= 0:
+            return marked / marked.sum()
         return rest if float(marked.sum()) <= 0 else 0.5 * (rest + marked / marked.sum())
 
 
@@ -85,14 +88,15 @@ def learn(
     """Learn a word from examples, whose order doesn't matter, from what the marks of each show, and from the
     query of the word's text, without synonyms. Raises UserError if there is no example, or the marks show
     nothing, or everything."""
-    if not examples:
+    if not any(example.shows_word for example in examples):
         raise UserError(f"there is no example of {name!r}: mark it in a photo")
     for example, one in zip(examples, weights, strict=True):
-        marked, everything = float(one.word.sum()), float(one.seen.sum())
+        marks = one.word + one.other * (not example.shows_word)
+        marked, everything = float(marks.sum()), float(one.seen.sum())
         if marked <= 1e-6 * max(everything, 1.0):
             trouble = "lie where the scene shows nothing, or cancel out"
             raise UserError(f"the marks of {name!r} in {example.photo} {trouble}")
-        if marked >= 0.98 * everything:
+        if example.shows_word and marked >= 0.98 * everything:
             raise UserError(f"{name!r} is everything that {example.photo} shows: mark the word alone")
     rows, photos = _sampled(examples, weights)
     sample = engine.features(rows).double()
@@ -108,11 +112,11 @@ def learn(
     # Each photo is judged by a word that the others teach.
     complete = {photo.name: photo for photo in photos if photo.complete}
     others = {name: [photo for photo in photos if photo.name != name] for name in complete}
-    judges = {name: fit(some) if some else word for name, some in others.items()}
+    judges = {name: fit(some) if any(p.shows_word for p in some) else word for name, some in others.items()}
     precision = {  # where a click is all that is known, the rest of the thing would count as an error
         name: photo.precision(judges[name].margins(sample, text)) for name, photo in complete.items()
     }
-    doubt = fmean(1 - photo.separation(word.margins(sample, text)) for photo in photos)
+    doubt = fmean(1 - p.separation(word.margins(sample, text)) for p in photos if p.shows_word)
     return replace(word, doubt=doubt, precision=precision, examples=tuple(examples))
 
 
@@ -129,6 +133,10 @@ class _Photo:
     """Share of the photo that is marked as the word."""
     evidence: int
     complete: bool
+
+    @property
+    def shows_word(self) -> bool:
+        return self.share > 0
 
     def precision(self, score: Float[Tensor, " m"]) -> float:
         """Compute a score's average precision, with Gaussians weighted by the pixels that they fill."""
@@ -161,7 +169,7 @@ def _sampled(
 ) -> tuple[Int[Tensor, " m"], list[_Photo]]:
     """Choose Gaussians to fit, and their weights in every photo: evenly spaced ones of the word, then evenly
     spaced ones of the rest (a Gaussian at an edge may be in both)."""
-    words = [one.word.double() / one.word.double().sum() for one in weights]
+    words = [one.word.double() / one.word.double().sum().clamp_min(1e-12) for one in weights]
     rests = [one.rest for one in weights]
     # Of each photo, since the few Gaussians of a click would be lost among those of an outline.
     most = _ROWS // len(weights)
@@ -171,7 +179,7 @@ def _sampled(
         word = F.pad(word[first], (0, len(second)))
         rest = F.pad(rest[second], (len(first), 0))
         kind = (float(one.word.sum() / one.seen.sum()), example.evidence, example.complete)
-        photos.append(_Photo(example.photo, word / word.sum(), rest / rest.sum(), *kind))
+        photos.append(_Photo(example.photo, word / word.sum().clamp_min(1e-12), rest / rest.sum(), *kind))
     return torch.cat([first, second]), photos
 
 
@@ -203,7 +211,7 @@ def _fitted(
     temperature: float,
     photos: Sequence[_Photo],
 ) -> TaughtWord:
-    word = torch.stack([photo.word for photo in photos]).mean(0)
+    word = torch.stack([photo.word for photo in photos if photo.shows_word]).mean(0)
     rest = torch.stack([photo.rest for photo in photos]).mean(0)
     evidence = sum(photo.evidence for photo in photos)
     middle, matrix = axes
@@ -221,7 +229,7 @@ def _trust(text: Float[Tensor, " m"], photos: Sequence[_Photo]) -> float:
     complete = [photo.precision(text) for photo in photos if photo.complete]
     if complete:
         return _GAIN * fmean(complete)
-    return max(fmean([2 * photo.separation(text) - 1 for photo in photos]), 0.0)
+    return max(fmean([2 * photo.separation(text) - 1 for photo in photos if photo.shows_word]), 0.0)
 
 
 def _logistic(
@@ -241,7 +249,7 @@ def _level(score: Float[Tensor, " m"], photos: Sequence[_Photo]) -> float:
     marks are complete; without any, part of the way from what is not clicked to what is."""
     complete = [photo for photo in photos if photo.complete]
     if not complete:
-        on = fmean([float(score @ photo.word) for photo in photos])
+        on = fmean([float(score @ photo.word) for photo in photos if photo.shows_word])
         return _UP * on + (1 - _UP) * fmean([float(score @ photo.rest) for photo in photos])
     order = score.argsort(descending=True, stable=True)
     overlap = torch.zeros_like(score)

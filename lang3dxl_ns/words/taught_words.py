@@ -35,8 +35,9 @@ _VERSION = 1
 
 @dataclass(frozen=True, eq=False)
 class Example:
-    """Marks in one photo: an outline or a box around everything that is the word, or clicks on some of it.
-    Coordinates are pixels of the photo's file, with the origin at its top-left corner."""
+    """Marks in one photo: an outline or a box around everything that is the word, clicks on some of it, or
+    clicks on what it is not alone, beside examples of what it is. Coordinates are pixels of the photo's file,
+    with the origin at its top-left corner."""
 
     photo: str
     """Name of the marked photo."""
@@ -59,7 +60,7 @@ class Example:
             points, others = (tuple(_finite(p, 2) for p in some) for some in (self.points, self.not_points))
             box = None if self.box is None else _finite(self.box, 4)
         vars(self).update(points=points, not_points=others, box=box)
-        if self.mask is None and self.box is None and not self.points:
+        if not self.shows_word and not self.not_points:
             raise UserError(f"nothing is marked in {self.photo}: give a mask, a box or a point on the word")
         if self.mask is not None and self.box is not None:
             raise UserError(f"{self.photo} has a mask and a box: give one of them")
@@ -73,6 +74,11 @@ class Example:
         """Number of clicks that the marks are worth."""
         points = len(self.points) + len(self.not_points)
         return points + (_OUTLINE if self.mask is not None else _BOX if self.box is not None else 0)
+
+    @property
+    def shows_word(self) -> bool:
+        """Whether anything is marked as the word."""
+        return self.complete or bool(self.points)
 
     @property
     def complete(self) -> bool:

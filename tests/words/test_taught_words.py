@@ -124,6 +124,20 @@ def test_a_point_that_is_not_the_word_takes_it_back(scene):
     assert photo not in taken.words["x"].precision
 
 
+def test_a_point_that_is_not_the_word_takes_it_back_from_a_photo_of_its_own_too(scene):
+    here, there = pixel(scene, ALL, 1.5, 1.5), pixel(scene, ALL, -1.8, -0.8)
+    both = Example(ALL, points=(here, there))
+    there = pixel(scene, "left/0001.jpg", -1.8, -0.8)
+    words = [
+        scene.teach("x", some) for some in ([both], [both, Example("left/0001.jpg", not_points=(there,))])
+    ]
+    before, after = (word.relevancy("x")[painted(2)].mean() for word in words)
+    assert after < before - 0.05
+    dome = [Example(ALL, points=(here,)), Example("left/0001.jpg", not_points=(there,))]
+    found = torch.from_numpy(scene.teach("x", dome).find("x").gaussians)
+    assert found[painted(1)].float().mean() > 0.9 and not found[painted(2)].any()
+
+
 def test_teaching_leaves_the_scene_as_it_was(scene):
     before = scene.relevancy("dome")
     taught = scene.teach("dome", Example(ALL, box=box(scene, ALL, *FIRST_WINDOW)))
@@ -179,7 +193,7 @@ EVERYTHING = np.ones((96, 96), bool)
         (lambda: Example(ALL, box=(-1e9, -1e9, 1e9, 1e9)), "is everything"),
         (lambda: Example(ALL, ~EVERYTHING), "is empty"),
         (lambda: Example(ALL), "nothing is marked"),
-        (lambda: Example(ALL, not_points=((1, 1),)), "nothing is marked"),
+        (lambda: Example(ALL, not_points=((1, 1),)), "no example"),
         (lambda: Example(ALL, EVERYTHING[:50]), "the whole photo"),
         (lambda: Example(ALL, points=((float("nan"), 1),)), "not a number"),
         (lambda: Example(ALL, box=(1, 2, float("inf"), 4)), "not a number"),
