@@ -15,7 +15,7 @@ from jaxtyping import Shaped, UInt8
 from numpy import ndarray as Array
 from PIL import ExifTags, Image
 
-from lang3dxl_ns.common.errors import DAMAGE, not_of_memory
+from lang3dxl_ns.common.errors import DAMAGE, in_a_line, not_of_memory
 from lang3dxl_ns.common.files import open_file
 
 FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP", "GIF", "AVIF", "HEIF")
@@ -24,7 +24,7 @@ _EXTRA = ("JXL",)
 """Formats that are accepted if a plugin of Pillow for them is installed."""
 PHOTO_SUFFIXES = (
     *(".jpg", ".jpeg", ".jfif", ".jpe", ".png", ".webp", ".tif", ".tiff", ".bmp", ".gif", ".avif"),
-    *(".heic", ".heif", ".hif", ".jxl"),
+    *(".heic", ".heif", ".hif", ".jxl", ".mpo"),
 )
 RAW_SUFFIXES = (
     *(".dng", ".cr2", ".cr3", ".crw", ".nef", ".nrw", ".arw", ".srf", ".sr2", ".raf", ".orf", ".rw2", ".pef"),
@@ -59,11 +59,13 @@ def open_picture(path: Path) -> Iterator[Image.Image]:
     except Image.UnidentifiedImageError as error:
         raise NoPictureError(f"not a picture in one of the formats {', '.join(_formats())}") from error
     # Pillow's decoders raise these for damaged files.
-    except (*DAMAGE, SyntaxError, Image.DecompressionBombError) as error:
+    except Image.DecompressionBombError as error:
+        raise NoPictureError(f"over {2 * (Image.MAX_IMAGE_PIXELS or 0):,} pixels: shrink it") from error
+    except (*DAMAGE, SyntaxError) as error:
         if isinstance(error, OSError) and error.errno is not None:  # an error of the disk, not of the decoder
             raise
         not_of_memory(error)
-        raise NoPictureError(str(error) or type(error).__name__) from error
+        raise NoPictureError(in_a_line(error)) from error
 
 
 def unreadable(path: Path) -> str | None:

@@ -290,7 +290,7 @@ class _File:
         self.shapes = {name: opened.get_slice(name).get_shape() for name in opened.keys()}  # noqa: SIM118
         self.about: dict[str, Any] = json.loads((opened.metadata() or {})[_KEY])
         if self.about["version"] != VERSION:
-            raise _NewerError(self.about["version"])
+            raise _NewerError(str(self.about["version"])[:40])
         self.scene: SceneRecord = scene_from_json(self.about["scene"])
         self.provenance = Provenance(**self.about["provenance"])
         expect(all(isinstance(t, str) for t in vars(self.provenance).values()), "its origin is no text")

@@ -40,6 +40,10 @@ _NOT_PHOTOS = {
 _KNOWN = (*PHOTO_SUFFIXES, *RAW_SUFFIXES, *OTHER_SUFFIXES)
 _OWN = re.compile(r"\.[0-9a-f]{16}\.(png|jpg)$")
 """Ends of the names of pictures in a feature store, which --cache-dir may put into the photos' folder."""
+_PHONE_PANORAMA = 6
+"""Value that phones give to EXIF's CustomRendered."""
+_WIDEST = 3.0
+"""Largest ratio of sides of a photo; stitched panoramas are wider."""
 
 
 @dataclass(frozen=True)
@@ -62,18 +66,20 @@ def find_photos(data: Path) -> PhotoFolder:
 
 def shared_cameras(photos: PhotoFolder) -> list[list[str]]:
     """Group the names by camera and lens: by maker, model, focal length and size. Photos without EXIF share a
-    camera if all of them have the same size; otherwise each has its own."""
+    camera if all of their folder have the same size, as frames of a video have; otherwise each has its
+    own."""
     groups: dict[tuple, list[str]] = {}
-    silent: dict[str, tuple[int, int]] = {}
+    silent: dict[Path, dict[str, tuple[int, int]]] = {}
     for name in photos.names:
         size, lens = _size_and_lens(photos.folder / name)
         if lens is None:
-            silent[name] = size
+            silent.setdefault(Path(name).parent, {})[name] = size
         else:
             groups.setdefault((size, *lens), []).append(name)
-    if len(set(silent.values())) == 1:
-        return [*groups.values(), list(silent)]
-    return [*groups.values(), *([name] for name in silent)]
+    found = list(groups.values())
+    for sizes in silent.values():
+        found += [list(sizes)] if len(set(sizes.values())) == 1 else [[name] for name in sizes]
+    return found
 
 
 def readable(photos: PhotoFolder) -> tuple[PhotoFolder, dict[str, str]]:
@@ -87,10 +93,27 @@ def readable(photos: PhotoFolder) -> tuple[PhotoFolder, dict[str, str]]:
         try:
             with open_picture(path) as image:
                 image.load() if image.format == "GIF" else image.verify()  # which reads nothing of a GIF
-            good.append(name)
+            if _is_panorama(path):
+                bad[name] = "a panorama, which no lens takes: use single photos, or cut views out of it"
+            else:
+                good.append(name)
         except (OSError, NoPictureError) as error:
             bad[name] = f"the file is damaged ({error})"
     return PhotoFolder(photos.folder, tuple(good)), bad
+
+
+def _is_panorama(path: Path) -> bool:
+    """Return whether a picture is a panorama: by its note for viewers of spheres, by a phone's, or since it
+    is wider than any lens takes."""
+    with open_picture(path) as image:
+        note = image.info.get("xmp", b"")
+        if b"GPano:ProjectionType" in (note.encode() if isinstance(note, str) else note):
+            return True
+        with suppress(Exception):  # damaged EXIF, which may hold anything
+            details = image.getexif().get_ifd(ExifTags.IFD.Exif)
+            if details.get(ExifTags.Base.CustomRendered) == _PHONE_PANORAMA:
+                return True
+        return max(image.size) > _WIDEST * min(image.size)
 
 
 def photos_below(folder: Path) -> list[str]:

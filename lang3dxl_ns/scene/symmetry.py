@@ -25,6 +25,8 @@ from lang3dxl_ns.scene.placements import MatchedPair, matched_pairs
 APART = 40.0
 """Degrees between a pair's rotation and its group's from which the pair contradicts the group. Focal lengths
 are guesses before mapping, which turns rotations by up to about half of this."""
+AGREEMENT = 0.55
+"""Share of the matches between two groups that has to agree on a rotation, or else the groups stay apart."""
 _VOTES = 30
 """Strongest pairs between two groups that vote on the rotation between them."""
 _VOICES = 3
@@ -71,7 +73,9 @@ def contradicting_pairs(pairs: Sequence[MatchedPair]) -> set[tuple[int, int]]:
         between[_key(pair.first, pair.second)].append(pair)
     votes = {key: _vote(groups, key, found) for key, found in between.items()}
     while votes:
-        (kept, joined), (turn, _) = max(votes.items(), key=lambda vote: vote[1][1])
+        (kept, joined), (turn, weight) = max(votes.items(), key=lambda vote: vote[1][1])
+        if weight == 0:
+            break
         groups.join(kept, joined, turn)
         moved: dict[tuple[int, int], list[MatchedPair]] = defaultdict(list)
         for key in [key for key in between if kept in key or joined in key]:
@@ -82,8 +86,10 @@ def contradicting_pairs(pairs: Sequence[MatchedPair]) -> set[tuple[int, int]]:
                 moved[_key(first, second)] += found
         votes |= {key: _vote(groups, key, found) for key, found in moved.items()}
         between |= moved
-    apart = [_degrees(groups.turn(pair)[None], np.eye(3))[0] > APART for pair in pairs]
-    return {(pair.first, pair.second) for pair, far in zip(pairs, apart, strict=True) if far}
+    together = [groups.group[pair.first] == groups.group[pair.second] for pair in pairs]
+    near = [_degrees(groups.turn(pair)[None], np.eye(3))[0] < APART for pair in pairs]
+    sound = np.logical_and(together, near)
+    return {(pair.first, pair.second) for pair, kept in zip(pairs, sound, strict=True) if not kept}
 
 
 def _key(one: int, other: int) -> tuple[int, int]:
@@ -94,7 +100,7 @@ def _vote(
     groups: _Groups, key: tuple[int, int], pairs: list[MatchedPair]
 ) -> tuple[Float[Array, "3 3"], float]:
     """Return the rotation from the second group to the first that the pairs between them agree on, and the
-    weight of the agreement."""
+    weight of the agreement; 0 if they disagree too much to tell."""
     voting = sorted(pairs, key=lambda pair: -pair.matches)[:_VOTES]
     turns = np.stack(
         [groups.turn(p) if groups.group[p.first] == key[0] else groups.turn(p).T for p in voting]
@@ -103,7 +109,8 @@ def _vote(
     agreeing = [_degrees(turns, turn) < APART / 2 for turn in turns]
     weight = [weights[near][:_VOICES].sum() for near in agreeing]
     near = agreeing[int(np.argmax(weight))]
-    return Rotation.from_matrix(turns[near]).mean(weights[near]).as_matrix(), float(max(weight))
+    agreed = weights[near].sum() > AGREEMENT * weights.sum()
+    return Rotation.from_matrix(turns[near]).mean(weights[near]).as_matrix(), float(max(weight) * agreed)
 
 
 def _degrees(turns: Float[Array, "n 3 3"], other: Float[Array, "3 3"]) -> Float[Array, " n"]:

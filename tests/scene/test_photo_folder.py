@@ -8,7 +8,7 @@ from PIL import ExifTags, Image
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.scene.pairing import pairs_to_match, similar_pairs
-from lang3dxl_ns.scene.photo_folder import find_photos, shared_cameras
+from lang3dxl_ns.scene.photo_folder import find_photos, readable, shared_cameras
 
 
 def put(path, size=(8, 6), body=None, focal=None):
@@ -62,6 +62,36 @@ def test_photos_of_several_sizes_without_exif_have_a_camera_each(tmp_path):
     for i, name in enumerate("abc"):
         put(tmp_path / f"{name}.jpg", size=(8, 6 + i // 2))
     assert groups(tmp_path) == [["a.jpg"], ["b.jpg"], ["c.jpg"]]
+
+
+def test_each_folder_of_frames_without_exif_has_one_camera(tmp_path):
+    """Two videos, and photos of strangers beside them."""
+    for folder, sizes in {
+        "drone": [(64, 36)] * 3,
+        "phone": [(64, 36)] * 2,
+        "found": [(30, 20), (20, 30)],
+    }.items():
+        (tmp_path / folder).mkdir()
+        for i, size in enumerate(sizes):
+            Image.new("RGB", size).save(tmp_path / folder / f"{i}.jpg")
+    groups = shared_cameras(find_photos(tmp_path))
+    assert sorted(map(len, groups)) == [1, 1, 2, 3]
+
+
+def test_panoramas_are_named_and_stereo_pictures_read(tmp_path):
+    phone = Image.Exif()
+    phone.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.CustomRendered] = 6
+    sphere = b'<x:xmpmeta><rdf GPano:ProjectionType="equirectangular"/></x:xmpmeta>'
+    Image.new("RGB", (60, 40)).save(tmp_path / "sweep.jpg", exif=phone)
+    Image.new("RGB", (60, 40)).save(tmp_path / "sphere.jpg", xmp=sphere)
+    Image.new("RGB", (160, 40)).save(tmp_path / "stitched.png")
+    Image.new("RGB", (90, 40)).save(tmp_path / "wide.png")
+    both = [Image.new("RGB", (60, 40), color) for color in ("red", "blue")]
+    both[0].save(tmp_path / "stereo.mpo", save_all=True, append_images=both[1:])
+    good, bad = readable(find_photos(tmp_path))
+    assert set(good.names) == {"wide.png", "stereo.mpo"}
+    assert set(bad) == {"sweep.jpg", "sphere.jpg", "stitched.png"}
+    assert all("panorama" in why for why in bad.values())
 
 
 def test_exif_tells_cameras_and_zooms_apart(tmp_path):
