@@ -3,6 +3,7 @@ import { element, explain, matched, percent, promptCard, say, shown } from "./ca
 import { Detail } from "./detail.js";
 import { Kept, readFields, Steps, written, MOST_PROMPTS } from "./history.js";
 import { unpacked } from "./library.js";
+import { distanceAsText } from "./measure.js";
 import { Photos } from "./photos.js";
 import { areExamples, asPython, drawOutline, examplesAsText, examplesFromText, inside, rounded, UNNAMED, wordsFile } from "./teach.js";
 import { thinker } from "./think.js";
@@ -13,7 +14,7 @@ const TYPING = 500, MOST_TRIED = 6, TIE = 0.02; // milliseconds until negatives 
 const $ = (id) => document.getElementById(id);
 const prompts = [], taughtHere = new Set(); // names that were taught to the server's scene from here
 let about, view, photos, steps, kept, latest = null, settled = false, cleared = 0; // settled: the address has been read; cleared: how often all prompts were removed
-let outlining = null, chosenLook = "";
+let ends = [], outlining = null, chosenLook = "";
 
 const think = thinker(
   (done) => say(`Reading what the scene means: ${percent(done)}`),
@@ -225,8 +226,17 @@ async function whatIs(x, y, most = 5) {
   return latest.words;
 }
 
+/** Mark an end of a distance; the second one tells it. */
+async function measure(x, y) {
+  const point = await think("point", { camera: view.picking, x, y });
+  if (!point) return say("Nothing is there: click another place.");
+  ends = ends.length === 1 ? [...ends, point] : [point];
+  say(ends.length === 1 ? "Click the other end." : distanceAsText(ends, about));
+}
+
 async function tell({ x, y, without }) {
   if (!about.words) return;
+  if ($("measuring").checked) return measure(x, y);
   const teaching = prompts.find((prompt) => prompt.examples && prompt.open);
   if (teaching) return addMark(teaching, [[x, y]], without || teaching.without);
   const words = await whatIs(x, y), { rows } = latest, best = words[0]?.[1] ?? 0;
@@ -465,6 +475,7 @@ function listen() {
     photos.draw();
     keepAddress();
   });
+  on("measuring", "change", () => ((ends = []), $("measuring").checked ? say("Click one end of what you measure.") : quiet()));
   on("free", "change", () => (view.mover.free = $("free").checked));
   on("fold", "click", () => ($("fold").ariaExpanded = String(!document.body.classList.toggle("folded"))));
   on("full", "click", () => (document.fullscreenElement ? document.exitFullscreen() : document.documentElement.requestFullscreen()));

@@ -7,7 +7,7 @@ import hashlib
 import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -148,6 +148,7 @@ class Page:
             "antialiased": scene.splats.antialiased,
             "background": [0, 0, 0] if scene.background is None else scene.background.tolist(),
             "up": (up / max(float(np.linalg.norm(up)), 1e-9)).tolist(),
+            "meters": None if scene.file.georeference is None else asdict(scene.file.georeference),
             "start": camera_json(scene.overview.full_camera),
             "colors": PROMPT_COLORS,
             "live": self.live,
