@@ -15,9 +15,10 @@ from fake_gpu import CUDA, GpuTensor, fake_gpu, real_gpu
 from scenes import write_scene
 
 from lab.baselines import BASELINES, langsplat
+from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.components.compression import CompressedField
 from lang3dxl_ns.open_scene import load_scene
-from lang3dxl_ns.training import gaussians
+from lang3dxl_ns.training import estimate, gaussians
 from lang3dxl_ns.training.step import decoded_side
 
 pytestmark = pytest.mark.nerfstudio
@@ -217,34 +218,19 @@ def test_a_resumed_run_goes_on(trained):
 
 def test_hours_without_gsplat_are_not_begun(monkeypatch):
     """A short run is; a long one says how long it would take, unless torch was chosen."""
-    from lang3dxl_ns.common.errors import UserError
-    from lang3dxl_ns.plugin import trainer_config
-    from lang3dxl_ns.plugin.trainer_config import Lang3DXLTrainerConfig
-
-    def settings(**changes):
-        config = Lang3DXLTrainerConfig(max_num_iterations=30_000)
-        config.machine.device_type = "cuda"
-        for name, value in changes.items():
-            setattr(config.pipeline.model, name, value)
-        return config
-
-    monkeypatch.setattr(trainer_config, "_torch_rendering_seconds", lambda: 0.1)
+    monkeypatch.setattr(estimate, "torch_rendering_seconds", lambda: 0.1)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    monkeypatch.setattr(trainer_config, "warn_of_unused_gpu", lambda: None)
-    monkeypatch.setattr(trainer_config.gsplat_build, "ready", lambda: False)
+    monkeypatch.setattr(estimate, "warn_of_unused_gpu", lambda: None)
+    monkeypatch.setattr(estimate.gsplat_build, "ready", lambda: False)
     with pytest.raises(UserError, match=r"30,000 iterations.*about 2.5 hours.*rasterizer torch"):
-        settings()._check_device()
-    settings(rasterizer="torch")._check_device()
-    short = settings()
-    short.max_num_iterations = 1_000
-    short._check_device()
+        estimate.check_device("cuda", "auto", 30_000)
+    estimate.check_device("cuda", "torch", 30_000)
+    estimate.check_device("cuda", "auto", 1_000)
 
 
 def test_a_rendering_by_torch_takes_time(gpu):
-    from lang3dxl_ns.plugin.trainer_config import _torch_rendering_seconds
-
     with gpu():
-        assert _torch_rendering_seconds(50, (40, 30)) > 0
+        assert estimate.torch_rendering_seconds(50, (40, 30)) > 0
 
 
 def test_the_torch_rasterizer_renders_on_the_gpu_without_gsplat(trained, monkeypatch):
@@ -359,7 +345,7 @@ def test_a_conversation_in_the_viewer(default, gpu):
     model = pipeline.model.eval()
     with gpu():
         session = Conversation(
-            model, pipeline.scene_file, default.base_dir, nullcontext(), lambda: False, lambda: None,
+            model.run, pipeline.scene_file, default.base_dir, nullcontext(), lambda: False, lambda: None,
             lambda: {"rgb"}, lambda _: None,
         )  # fmt: skip
         session.ask("tower")

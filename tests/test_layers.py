@@ -122,11 +122,9 @@ def test_a_planted_string_is_found():
 OWN = {"model", "pipeline", "scene", "trainer", "decoder", "splats", "camera", "config", "datamanager"}
 """Names of parameters and fields that hold classes of this package or of nerfstudio."""
 STILL_ANY = {
-    *("plugin/conversation.py model", "plugin/panel.py pipeline", "plugin/trainer.py config"),
-    "plugin/inert_settings.py model",
     *("preparation/encoders.py model", "preparation/families.py model"),  # models of transformers
 }
-"""The circles that are left."""
+"""Classes of other packages."""
 
 
 def typed_any(source: str) -> set[str]:

@@ -35,7 +35,7 @@ _SWITCHES = [
 ]
 _WORD = "dome"
 _DRAWN = """async () => {
-  while (!window.lang3dxl?.view?.measured) await new Promise((go) => setTimeout(go, 20));
+  while ((window.lang3dxl?.view?.cost ?? 160) === 160) await new Promise((go) => setTimeout(go, 20));
 }"""
 _ANSWERED = f"lang3dxl.ready.then(() => lang3dxl.ask({_WORD!r})).then(() => true)"
 _DRAG = """async () => {

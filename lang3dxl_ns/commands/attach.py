@@ -27,9 +27,9 @@ if TYPE_CHECKING:
 class Attach(AttachConfig):
     """Give words to a finished splat: write a scene that answers any text, without training colors again.
 
-    Reads PLY files of any program (also SuperSplat's compressed ones), .spz, .splat, gsplat's checkpoints,
-    and runs of nerfstudio's splatfacto. With --data, words are learned from the splat's photos. Without it,
-    they are learned from views of the splat itself, which is less accurate.
+    Reads PLY files of any program (also SuperSplat's compressed ones), .spz, .sog, .glb, .splat, gsplat's
+    checkpoints, and runs of nerfstudio's splatfacto. With --data, words are learned from the splat's photos.
+    Without it, they are learned from views of the splat itself, which is less accurate.
     """
 
     splat: tyro.conf.Positional[Path]

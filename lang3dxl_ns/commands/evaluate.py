@@ -85,7 +85,7 @@ class EvaluateRun(_Scored):
     """Folder of ground truth (default: the run's setting, or the one beside its data)."""
 
     def main(self) -> None:
-        from lang3dxl_ns.files.runs import OUTPUTS
+        from lang3dxl_ns.files.runs import OUTPUTS, find_config
 
         place = self.run or OUTPUTS
         if place.suffix == ".scene" or (
@@ -103,7 +103,7 @@ class EvaluateRun(_Scored):
         if self.ground_truth is not None or self.layout != "auto":
             pipeline.config.ground_truth_layout = self.layout
         results = pipeline.evaluation.scored(get_std=True)
-        if taught := _taught_beside(place):
+        if taught := _taught_beside(find_config(self.run).parent):
             results["protocol"]["taught_words_left_out"] = taught
             words = ", ".join(taught)
             say(f"Scored by text alone: what examples taught ({words}) counts where the .scene file is named")
@@ -195,7 +195,7 @@ def _taught_beside(run: Path) -> list[str]:
     from lang3dxl_ns.files.scene_file import describe_scene_file
 
     taught: list[str] = []
-    for file in sorted((run if run.is_dir() else run.parent).glob("[!.]*.scene")):
+    for file in sorted(run.glob("[!.]*.scene")):
         with suppress(UserError):  # a damaged one has no say in the run's figures
             taught += [word.name for word in describe_scene_file(file)["taught"]]
     return taught

@@ -242,7 +242,7 @@ class Export:
     not_: _Not = field(default_factory=list)
     """Negative for all texts. Repeat the flag for more."""
     out: Path | None = None
-    """Splat file to write, .ply or .spz."""
+    """Splat file to write, .ply, .spz, .sog or .glb."""
     web: Path | None = None
     """Folder for a web page that any static server can serve."""
     vocabulary: Path | None = None
@@ -250,7 +250,7 @@ class Export:
     photos: Path | None = None
     """Folder of the scene's photos, of which the page shows small copies (default: none are published)."""
     scene_file: Path | None = None
-    """Scene file to write, NAME.scene."""
+    """Scene file to write, NAME.scene, or NAME.glb, which viewers of glTF show too."""
     title: str = ""
     """Title of page and scene (default: the scene's own, or the name of the photos' folder)."""
     credit: str = ""

@@ -12,7 +12,7 @@ import tyro
 from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.settings_help import showing, without
 from lang3dxl_ns.preparation.settings import PreparationConfig
-from lang3dxl_ns.training.settings import SceneSettings
+from lang3dxl_ns.training.scene_settings import SceneSettings
 
 if TYPE_CHECKING:
     from lang3dxl_ns.training.fit import Settings

@@ -176,7 +176,8 @@ def expanded(path: str | Path) -> Path:
     """Replace ~ in a path. Raises UserError for the home of an unknown user, and for what no path can be."""
     name = os.fsencode(path)
     if b"\0" in name or len(name) > _LONGEST_PATH or any(len(part) > 255 for part in name.split(b"/")):
-        raise UserError(f"{os.fsdecode(name[:60])} … is no path: it is too long, or holds a null character")
+        begin = os.fsdecode(name[:60])
+        raise UserError(f"{begin} … is no path (too long, or a null character): choose a shorter name")
     try:
         return Path(path).expanduser()
     except RuntimeError as error:

@@ -15,7 +15,7 @@ from jaxtyping import Shaped, UInt8
 from numpy import ndarray as Array
 from PIL import ExifTags, Image
 
-from lang3dxl_ns.common.errors import DAMAGE, not_of_memory
+from lang3dxl_ns.common.errors import DAMAGE, in_a_line, not_of_memory
 from lang3dxl_ns.common.files import open_file
 
 FORMATS = ("JPEG", "PNG", "WEBP", "TIFF", "BMP", "GIF", "AVIF", "HEIF")
@@ -59,11 +59,13 @@ def open_picture(path: Path) -> Iterator[Image.Image]:
     except Image.UnidentifiedImageError as error:
         raise NoPictureError(f"not a picture in one of the formats {', '.join(_formats())}") from error
     # Pillow's decoders raise these for damaged files.
-    except (*DAMAGE, SyntaxError, Image.DecompressionBombError) as error:
+    except Image.DecompressionBombError as error:
+        raise NoPictureError(f"over {2 * (Image.MAX_IMAGE_PIXELS or 0):,} pixels: shrink it") from error
+    except (*DAMAGE, SyntaxError) as error:
         if isinstance(error, OSError) and error.errno is not None:  # an error of the disk, not of the decoder
             raise
         not_of_memory(error)
-        raise NoPictureError(str(error) or type(error).__name__) from error
+        raise NoPictureError(in_a_line(error)) from error
 
 
 def unreadable(path: Path) -> str | None:

@@ -53,9 +53,10 @@ class Stages:
         """End the present stage, if there is one."""
         self._current = None
 
-    def progress(self, done: float) -> None:
+    def progress(self, done: float, note: str = "") -> None:
         """Say about how long everything that is left takes at the pace of the last minute, once that is
-        known, and at every tenth of the stage. `done` is the fraction of the stage in this command."""
+        known, and at every tenth of the stage. `done` is the fraction of the stage in this command; `note`
+        is said along."""
         now = time.perf_counter()
         self._recent.append((now, done))
         while len(self._recent) > 2 and now - self._recent[1][0] > _WINDOW_S:
@@ -68,7 +69,8 @@ class Stages:
         before, done_before = self._recent[0]
         left = (now - before) / max(done - done_before, 1e-9) * (1 - done + ahead)
         if self._tenths < 10:
-            say(f"{self._current}: {100 * done:.0f} % done; {roughly(left)} left in all")
+            state = f"{100 * done:.0f} % done" + (f", {note}" if note else "")
+            say(f"{self._current}: {state}; {roughly(left)} left in all")
 
     def weigh(self, name: str, other: str, times: float) -> None:
         """Expect a stage to take `times` as long as another one."""

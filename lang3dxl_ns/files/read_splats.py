@@ -1,4 +1,4 @@
-"""Splats of other programs: PLY of any kind, SPZ, .splat, checkpoints of gsplat and nerfstudio.
+"""Splats of other programs: PLY of any kind, SPZ, SOG, GLB, .splat, checkpoints of gsplat and nerfstudio.
 
 Sizes are compared with the file's before anything of that size is allocated. No code in a file is executed.
 """
@@ -22,11 +22,15 @@ from lang3dxl_ns.common.errors import DAMAGE, UserError, in_a_line, not_of_memor
 from lang3dxl_ns.common.files import expanded
 from lang3dxl_ns.files.activations import check_memory, tensor_of
 from lang3dxl_ns.files.checkpoints import read_checkpoint
+from lang3dxl_ns.files.glb import read_glb
 from lang3dxl_ns.files.ply import read_ply
+from lang3dxl_ns.files.sog import read_sog
 from lang3dxl_ns.files.spz import read_spz
 from lang3dxl_ns.rendering import Splats, harmonics_of
 
-KINDS = ".ply, .spz, .splat, a checkpoint of gsplat (.pt) or nerfstudio (.ckpt), or a run's folder"
+KINDS = (
+    ".ply, .spz, .sog, .glb, .splat, a checkpoint of gsplat (.pt) or nerfstudio (.ckpt), or a run's folder"
+)
 _IN_FOLDERS = ("*.ckpt", "nerfstudio_models/*.ckpt", "ckpts/*.pt", "point_cloud/iteration_*/point_cloud.ply")
 """Patterns of the files in which programs leave splats in a run's folder."""
 _MOST_DAMAGE = 0.5
@@ -53,8 +57,9 @@ def read_splats(path: str | Path) -> Splats:
     Gaussians with NaN or infinite values keep their place, but lose their size and opacity.
 
     Args:
-        path: .ply (as 3D Gaussian splatting writes it, or compressed by SuperSplat), .spz, .splat, a gsplat
-            checkpoint (.pt), a splatfacto checkpoint (.ckpt), or the folder of a run with one of them.
+        path: .ply (as 3D Gaussian splatting writes it, or compressed by SuperSplat), .spz, .sog,
+            .glb, .splat, a gsplat checkpoint (.pt), a splatfacto checkpoint (.ckpt), or the folder of a run
+            with one of them.
 
     Raises:
         UserError: there is no such file, or it is damaged, cut short, too large for this machine, of another
@@ -133,6 +138,6 @@ def _splat(path: Path) -> Splats:
 
 
 _READERS: dict[str, Callable[[Path], Splats]] = {
-    **{".ply": read_ply, ".spz": read_spz, ".splat": _splat},
+    **{".ply": read_ply, ".spz": read_spz, ".splat": _splat, ".sog": read_sog, ".glb": read_glb},
     **{".pt": read_checkpoint, ".pth": read_checkpoint, ".ckpt": read_checkpoint},
 }

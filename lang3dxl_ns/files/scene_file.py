@@ -10,10 +10,11 @@ from __future__ import annotations
 import io
 import json
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, replace
 from math import prod
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, TypeVar
 
 import numpy as np
@@ -34,6 +35,7 @@ from lang3dxl_ns.components.appearance import AppearanceConfig, AppearanceField
 from lang3dxl_ns.components.decoders import DecoderConfig, make_decoder
 from lang3dxl_ns.components.feature_decoder import Decoder
 from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
+from lang3dxl_ns.files import glb
 from lang3dxl_ns.files.activations import log_scales, logits
 from lang3dxl_ns.query.question import QueryConfig
 from lang3dxl_ns.query.scene import Scene
@@ -77,14 +79,15 @@ class Provenance:
 
 
 def check_scene_name(path: Path) -> None:
-    """Raise UserError if the name doesn't end in .scene."""
-    if path.suffix != SUFFIX:
-        raise UserError(f"{path.name} doesn't name a scene: end it in {SUFFIX}")
+    """Raise UserError if the name ends neither in .scene nor in .glb."""
+    if path.suffix not in (SUFFIX, glb.SUFFIX):
+        raise UserError(f"{path.name} doesn't name a scene: end it in {SUFFIX}, or in {glb.SUFFIX}")
 
 
 def write_scene(path: Path, scene: Scene, provenance: Provenance | None = None) -> int:
     """Write a scene as one file, atomically, with foreground masks read from their files. Return the number
-    of bytes. Raises UserError as `check_scene_name`."""
+    of bytes. A .glb is the scene's splats with its file inside, which viewers of glTF show.
+    Raises UserError as `check_scene_name`."""
     check_scene_name(path)
     from safetensors.numpy import save
 
@@ -131,6 +134,9 @@ def write_scene(path: Path, scene: Scene, provenance: Provenance | None = None) 
     photos = [replace(photo, mask=None) for photo in scene.photos]
     described["scene"] = asdict(replace(scene.file, photos=photos, data=Path(scene.file.data).name))
     data = save(content, {_KEY: json.dumps(described, separators=(",", ":"))})
+    if path.suffix == glb.SUFFIX:
+        baked = scene.baked()
+        data = glb.encode_glb(baked.select(baked.sound()), data)
     write_atomically(path, data)
     return len(data)
 
@@ -140,6 +146,10 @@ def keep_words(path: Path, words: Mapping[str, TaughtWord | None]) -> None:
     another command taught meanwhile stay. Raises UserError as `read_scene`."""
     from safetensors.numpy import save
 
+    if path.suffix == glb.SUFFIX:
+        raise UserError(
+            f"{path} keeps no words: write a scene, lang3dxl export {path} --scene-file NAME{SUFFIX}"
+        )
     with _opened(path) as file:
         kept = {**{known_word(word.name): word for word in file.taught}, **words}
         described = file.about | {"taught": [word.to_json() for word in kept.values() if word is not None]}
@@ -280,7 +290,7 @@ class _File:
         self.shapes = {name: opened.get_slice(name).get_shape() for name in opened.keys()}  # noqa: SIM118
         self.about: dict[str, Any] = json.loads((opened.metadata() or {})[_KEY])
         if self.about["version"] != VERSION:
-            raise _NewerError(self.about["version"])
+            raise _NewerError(str(self.about["version"])[:40])
         self.scene: SceneRecord = scene_from_json(self.about["scene"])
         self.provenance = Provenance(**self.about["provenance"])
         expect(all(isinstance(t, str) for t in vars(self.provenance).values()), "its origin is no text")
@@ -332,8 +342,12 @@ def _opened(path: Path) -> Iterator[_File]:
     if not path.is_file():
         raise UserError(f"{path} is not a file: name a {SUFFIX} file")
     try:
-        with safe_open(path, "np") as opened:
-            yield _File(opened)
+        with ExitStack() as stack:
+            place = path
+            if path.suffix == glb.SUFFIX:
+                place = Path(stack.enter_context(TemporaryDirectory())) / "record"
+                place.write_bytes(glb.scene_record(path))
+            yield _File(stack.enter_context(safe_open(place, "np")))
     except _NewerError as error:
         raise UserError(f"{path} has format {error}: a newer lang3dxl-ns wrote it; update yours") from error
     except (UserError, SafetensorError, SyntaxError, Image.DecompressionBombError, *DAMAGE) as error:

@@ -1,4 +1,4 @@
-"""Splat files (PLY, SPZ) for other programs."""
+"""Splat files (PLY, SPZ, SOG, GLB) for other programs."""
 
 from __future__ import annotations
 
@@ -13,22 +13,28 @@ from torch import Tensor
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import write_atomically
+from lang3dxl_ns.files.glb import encode_glb
 from lang3dxl_ns.files.ply import encode_ply
+from lang3dxl_ns.files.sog import encode_sog
 from lang3dxl_ns.files.spz import encode_spz
 from lang3dxl_ns.rendering import Splats
 
+_WRITERS: dict[str, Callable[[Splats], bytes]] = {
+    **{".ply": encode_ply, ".spz": encode_spz, ".sog": encode_sog, ".glb": encode_glb}
+}
+SPLAT_NAMES = ".ply, .spz, .sog or .glb"
+
 
 def write_splats(path: Path, splats: Splats, relevancy: Float[Tensor, " n"] | None = None) -> int:
-    """Write a .ply or .spz file, without Gaussians that have a NaN or infinite value, and return the number
-    of those written. relevancy: each Gaussian's to a prompt, 0…1, written to a PLY as the property
+    """Write a .ply, .spz, .sog or .glb file, without Gaussians that have a NaN or infinite value, and return
+    the number of those written. relevancy: each Gaussian's to a prompt, 0…1, written to a PLY as the property
     `relevancy`. Raises UserError if the ending names another kind of file, or .spz cannot hold such
     coordinates."""
     check_splat_name(path)
     sound = splats.sound()
     splats, relevancy = splats.select(sound), None if relevancy is None else relevancy[sound]
-    write_atomically(
-        path, encode_ply(splats, relevancy) if path.suffix.lower() == ".ply" else encode_spz(splats)
-    )
+    kind = path.suffix.lower()
+    write_atomically(path, encode_ply(splats, relevancy) if kind == ".ply" else _WRITERS[kind](splats))
     return len(splats)
 
 
@@ -43,8 +49,8 @@ def write_index(path: Path, selected: Bool[Tensor, " n"]) -> None:
 
 
 def check_splat_name(path: Path) -> None:
-    """Raise UserError if the path is a folder, or its name ends in neither .ply nor .spz."""
+    """Raise UserError if the path is a folder, or its name ends in none of `SPLAT_NAMES`."""
     if path.is_dir():
-        raise UserError(f"{path} is a folder: name a .ply or .spz file in it")
-    if path.suffix.lower() not in (".ply", ".spz"):
-        raise UserError(f"{path.name} names no kind of splat file: end it in .ply or .spz")
+        raise UserError(f"{path} is a folder: name a {SPLAT_NAMES} file in it")
+    if path.suffix.lower() not in _WRITERS:
+        raise UserError(f"{path.name} names no kind of splat file: end it in {SPLAT_NAMES}")

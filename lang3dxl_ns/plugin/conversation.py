@@ -20,6 +20,9 @@ from lang3dxl_ns.query.scene import Scene, text_encoder
 from lang3dxl_ns.query.text import EncodeTexts, caution
 from lang3dxl_ns.rendering import Rendering
 from lang3dxl_ns.scene.record import SceneRecord
+from lang3dxl_ns.training.learn_codes import forget_words
+from lang3dxl_ns.training.snapshot import snapshot
+from lang3dxl_ns.training.state import Training
 
 _LONGEST = 40
 """Most characters of a prompt in the summary."""
@@ -31,8 +34,8 @@ class Conversation:
     a separate scene, so that only taking the snapshot waits for training; then words are first learned from
     the photos, if the decoder learns from lifted features."""
 
-    model: Any
-    """A `Lang3DXLModel`, trained or in training."""
+    model: Training
+    """What is asked, trained or in training."""
     file: SceneRecord
     """Photos, cameras and CLIP."""
     run: Path
@@ -94,7 +97,7 @@ class Conversation:
         """Return a snapshot of the present model. After training there is one final snapshot; during training
         a snapshot is reused for at most a tenth of the run."""
         with self._making:
-            behind, taken = self.model.config.total_steps / 10, self._scene_step
+            behind, taken = self.model.settings.total_steps / 10, self._scene_step
             recent = taken is None or (self.learning() and self.model.step - taken <= behind)
             if self._scene is None or not recent:
                 self._encode_texts = self._encode_texts or text_encoder(self.file, self.model.device)
@@ -103,26 +106,22 @@ class Conversation:
 
     def _snapshot(self) -> tuple[Scene, int | None]:
         """Take a snapshot; return it with the iteration that it was taken at (None: training was over)."""
-        field = self.model.semantic_field
         with self.lock, torch.no_grad():
             # Asked inside the lock, since training may end, and learn its words, while it is waited for.
-            learning, step, training = self.learning(), self.model.step, self.model.training
+            learning, step = self.learning(), self.model.step
             # In training every snapshot is examined anew, so keep that brief.
             config = QueryConfig(views=24, view_side=160) if learning else QueryConfig()
             cache = None if learning else self.run / "lang3dxl_visible.safetensors"
-            self.model.train(False)
             try:
-                if learning and field is not None and field.needs_lifting:
+                if learning and self.model.learns_words_at_the_end:
                     self.watch("gathering the photos' features onto the present scene…")
                     self.learn()
-                scene = self.model.scene(
-                    self.file, config=config, encode_texts=self._encode_texts, cache=cache, watch=self.watch
-                )
+                how: dict[str, Any] = {"cache": cache, "watch": self.watch}
+                scene = snapshot(self.model, self.file, config=config, encode_texts=self._encode_texts, **how)
                 return scene, step if learning else None
             finally:
                 if learning:
-                    self.model.forget_gathered_codes()
-                self.model.train(training)
+                    forget_words(self.model)
 
     # ── answering: called by the render thread, which holds the lock ────────────────────────────────
 

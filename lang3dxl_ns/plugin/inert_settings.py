@@ -7,7 +7,9 @@ from typing import Any
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.plugin.optimizers import parameter_groups
+from lang3dxl_ns.preparation.settings import PreparationConfig
 from lang3dxl_ns.training.learning_rates import learning_rates
+from lang3dxl_ns.training.settings import TrainingSettings
 
 OF_SPLATFACTO = (
     *("enable_collider", "collider_params", "loss_coefficients", "eval_num_rays_per_chunk", "prompt"),
@@ -37,7 +39,9 @@ _GROUPS_OF_RENDERINGS = ("codes", "field_encoding", "field_decoder", "downsample
 """Optimizer groups of such semantics."""
 
 
-def check_inert(model: Any, data: Any, optimizers: Mapping[str, Any] | None = None) -> None:
+def check_inert(
+    model: TrainingSettings, data: PreparationConfig, optimizers: Mapping[str, Any] | None = None
+) -> None:
     """Raise UserError if a setting that has no effect in this run differs from its default. model, data:
     settings of the model and of the data manager. optimizers: those of the parameter groups."""
     changed = [

@@ -16,7 +16,6 @@ from lang3dxl_ns.plugin.model_config import ModelSettings
 from lang3dxl_ns.plugin.rendering_model import RenderingModel
 from lang3dxl_ns.plugin.splatfacto import SplatfactoModel
 from lang3dxl_ns.preparation.targets import Batch, foreground
-from lang3dxl_ns.training.learn_codes import forget_words
 from lang3dxl_ns.training.state import Training
 from lang3dxl_ns.training.step import finish, losses
 
@@ -48,10 +47,6 @@ class Lang3DXLModel(RenderingModel):
     def step_post_backward(self, step: int) -> None:
         """Finish an iteration."""
         finish(self.run)
-
-    def forget_gathered_codes(self) -> None:
-        """Remove codes that were gathered for a question in training, since the Gaussians still change."""
-        forget_words(self.run)
 
     def get_param_groups(self) -> dict[str, list[Parameter]]:
         """Return the optimizer groups: one per Gaussian property, and those of the parts."""

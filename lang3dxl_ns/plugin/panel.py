@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from contextlib import nullcontext
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 import viser
@@ -18,10 +18,11 @@ from numpy import ndarray as Array
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.worker import Worker
 from lang3dxl_ns.plugin.conversation import Conversation, plain
+from lang3dxl_ns.plugin.rendering_model import RenderingModel
 from lang3dxl_ns.plugin.viewer_guard import guard_viewers
 from lang3dxl_ns.query.match import Found
 from lang3dxl_ns.scene.camera import Camera
-from lang3dxl_ns.scene.record import overview
+from lang3dxl_ns.scene.record import SceneRecord, overview
 
 if TYPE_CHECKING:
     from nerfstudio.viewer.viewer import Viewer
@@ -35,11 +36,26 @@ _TYPING = 0.5
 """Seconds after the last keystroke until the text takes effect."""
 
 
+class Asked(Protocol):
+    """What the panel asks of a pipeline, whose module imports this one."""
+
+    @property
+    def model(self) -> RenderingModel: ...
+
+    @property
+    def scene_file(self) -> SceneRecord: ...
+
+    @property
+    def query(self) -> str: ...
+
+    def learn_words(self) -> None: ...
+
+
 class AskPanel(ViewerControl):
     """A text box, heat maps over the view, and the views that show a match best. nerfstudio's viewer finds
-    the panel as an attribute of the pipeline (whose module imports this one), and sets it up on start."""
+    the panel as an attribute of the pipeline, and sets it up on start."""
 
-    def __init__(self, pipeline: Any) -> None:
+    def __init__(self, pipeline: Asked) -> None:
         guard_viewers()  # must precede the server that nerfstudio starts
         self._pipeline, self._model = pipeline, pipeline.model
         self._views: list[tuple[Found, int]] = []
@@ -78,7 +94,7 @@ class AskPanel(ViewerControl):
 
     def _start(self, viewer: Viewer) -> None:
         self.conversation = Conversation(
-            self._model,
+            self._model.run,
             self._pipeline.scene_file,
             viewer.log_filename.parent,
             viewer.train_lock or nullcontext(),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from pathlib import Path
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -27,9 +27,8 @@ from lang3dxl_ns.plugin.conversation import Conversation
 from lang3dxl_ns.plugin.model_config import ModelSettings
 from lang3dxl_ns.plugin.splatfacto import SplatfactoModel
 from lang3dxl_ns.preparation.targets import SceneFacts
-from lang3dxl_ns.query.question import QueryConfig, Question, pictures
+from lang3dxl_ns.query.question import Question, pictures
 from lang3dxl_ns.query.scene import Scene
-from lang3dxl_ns.query.text import EncodeTexts
 from lang3dxl_ns.rendering import Rendering, Splats, composite
 from lang3dxl_ns.rendering.rasterize import Backend
 from lang3dxl_ns.scene.record import SceneRecord
@@ -123,20 +122,10 @@ class RenderingModel(SplatfactoModel):
 
     # ── the scene so far ────────────────────────────────────────────────────────────────────────────
 
-    @torch.no_grad()
-    def scene(
-        self,
-        file: SceneRecord,
-        *,
-        config: QueryConfig | None = None,
-        encode_texts: EncodeTexts | None = None,
-        cache: Path | None = None,
-        watch: Callable[[str], None] | None = None,
-    ) -> Scene:
-        """Copy the present state to a separate scene, which later training doesn't change, with the photos,
-        cameras and CLIP of a file; for the other arguments see `Scene`. While a model has no words yet, its
-        scene has colors only."""
-        return snapshot(self.run, file, config=config, encode_texts=encode_texts, cache=cache, watch=watch)
+    def scene(self, file: SceneRecord, **how: Any) -> Scene:
+        """Copy the present state to a separate scene with the photos, cameras and CLIP of a record; see
+        `snapshot`."""
+        return snapshot(self.run, file, **how)
 
     # ── looking ─────────────────────────────────────────────────────────────────────────────────────
 

@@ -4,23 +4,19 @@ from __future__ import annotations
 
 import os
 import shlex
-import shutil
 import signal
 import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from statistics import median
-from time import perf_counter
-from types import FrameType
 from typing import Any, Literal
 
 import torch
 from nerfstudio.engine.callbacks import TrainingCallbackLocation
 from nerfstudio.engine.optimizers import Optimizers
-from nerfstudio.engine.trainer import Trainer
+from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils import writer
 from nerfstudio.utils.decorators import check_main_thread
 from nerfstudio.utils.rich_utils import CONSOLE
@@ -30,28 +26,25 @@ from torch.cuda.amp.grad_scaler import GradScaler
 from lang3dxl_ns.common.console import say, some
 from lang3dxl_ns.common.device import multiplies_bfloat16
 from lang3dxl_ns.common.errors import UserError, not_of_memory
-from lang3dxl_ns.common.files import expanded, replace_durably
+from lang3dxl_ns.common.files import expanded
 from lang3dxl_ns.common.memory import ran_out_of_memory
-from lang3dxl_ns.common.reports import synchronize
-from lang3dxl_ns.common.stages import Stages, roughly
+from lang3dxl_ns.common.options import data_option
+from lang3dxl_ns.common.stages import Stages
+from lang3dxl_ns.common.stopping import stoppable
 from lang3dxl_ns.files.scene_file import SUFFIX, Provenance, replace_scene
 from lang3dxl_ns.plugin.optimizers import GuardedOptimizers
-from lang3dxl_ns.plugin.pipeline import Lang3DXLPipeline
+from lang3dxl_ns.plugin.pipeline import Lang3DXLPipeline, Lang3DXLPipelineConfig
 from lang3dxl_ns.plugin.run_checkpoint import NOT_A_CHECKPOINT, check_checkpoint, read_checkpoint
 from lang3dxl_ns.preparation.needs import NEEDS_FILE, write_needs
 from lang3dxl_ns.preparation.store import PhotosGoneError
 from lang3dxl_ns.scene.record import SCENE_FILE, SceneRecord
+from lang3dxl_ns.training.checkpoint import save_checkpoint
+from lang3dxl_ns.training.estimate import estimate
 from lang3dxl_ns.training.learn_codes import forget_words
 from lang3dxl_ns.training.learning_rates import add_rows_to_state
-from lang3dxl_ns.training.memory import plan
+from lang3dxl_ns.training.memory import out_of_memory, plan
 from lang3dxl_ns.training.step_guard import StepGuard
 
-RENDERINGS_PER_STEP = {False: 3.0, True: 4.0}
-"""Duration of an iteration in renderings of its photo, by whether semantics are trained with the scene: 1.5
-to 2.7 on landmarks and `castle`, and 3.0 for `paper` on a landmark, measured on a busy CPU."""
-RENDERINGS_PER_PHOTO = 30.0
-"""Duration of reading a photo's features onto the Gaussians, in renderings of it: measured 30 on one core for
-160 channels, 18,000 Gaussians, 240×180 pixels."""
 _BEFORE_TRAINING = ("config.yml", SCENE_FILE, f"{NEEDS_FILE}.*", "dataparser_transforms.json", "events.*")
 """Names of a run's files that are written before training."""
 
@@ -85,7 +78,16 @@ def _disk_kept_out_of_training() -> Iterator[None]:
         writer.write_out_storage, threading.excepthook = write, ends_badly
 
 
-def requested_checkpoint(config: Any) -> Path | None:
+@dataclass
+class RunConfig(TrainerConfig):
+    """Settings that the trainer reads; `Lang3DXLTrainerConfig` fits them to a run."""
+
+    pipeline: Lang3DXLPipelineConfig = field(default_factory=Lang3DXLPipelineConfig)
+    max_skipped_steps: int = 20
+    """Most steps in a row that are skipped, because loss or gradient is not finite, before the run stops."""
+
+
+def requested_checkpoint(config: TrainerConfig) -> Path | None:
     """Find the checkpoint that a run's settings resume. Raises UserError if it doesn't exist."""
     folder, path = config.load_dir, config.load_checkpoint
     if folder is not None:
@@ -102,8 +104,7 @@ class Lang3DXLTrainer(Trainer):
     """nerfstudio's trainer with atomic checkpoints, resumed runs that end at the requested iteration, and a
     guard against steps that are not finite."""
 
-    config: Any
-    """Settings of the run, a `Lang3DXLTrainerConfig`; that class's module imports this one."""
+    config: RunConfig
     pipeline: Lang3DXLPipeline
     optimizers: GuardedOptimizers
     stages: Stages
@@ -117,7 +118,7 @@ class Lang3DXLTrainer(Trainer):
     _is_ending = False
     _run_state: dict[str, Any] | None = None
 
-    def __init__(self, config: Any, local_rank: int = 0, world_size: int = 1) -> None:
+    def __init__(self, config: RunConfig, local_rank: int = 0, world_size: int = 1) -> None:
         """Set up mixed precision: bfloat16 where the hardware has it. Its range is float32's, so gradients
         need no scale, and no step is lost or waits for one. Older GPUs (before Ampere) use float16 with a
         scale. Raises UserError for a CPU without bfloat16, on which nerfstudio would ignore the setting."""
@@ -296,7 +297,7 @@ class Lang3DXLTrainer(Trainer):
             self._announce_time()
             writer.GLOBAL_BUFFER.setdefault("step", self.step)  # the end reads it, also without any step
             self.stages.begin("train")
-            with self._stoppable(), _disk_kept_out_of_training():
+            with stoppable(self._stop), _disk_kept_out_of_training():
                 super().train()
         except PhotosGoneError as error:
             raise UserError(f"{error}. {self._stop_early()}") from error
@@ -312,63 +313,28 @@ class Lang3DXLTrainer(Trainer):
         if self.interrupted is not None:
             sys.exit(128 + self.interrupted)
 
-    @torch.no_grad()
     def _announce_time(self) -> None:
-        """Log how long training and learning words will take with the present Gaussians. The estimate comes
-        from the median of five renderings of a photo's view, since the first may compile kernels, and others
-        may wait for another program."""
-        model, cameras = self.pipeline.model, self.pipeline.datamanager.train_dataset.cameras
-        middle = int((cameras.width * cameras.height).flatten().argsort()[len(cameras) // 2])
+        """Log how long training and learning words will take with the present Gaussians."""
+        count, cameras = self.config.max_num_iterations, self.pipeline.datamanager.data.cameras
         with self.train_lock:  # the viewer may render at the same time
-            model.eval()
-            times = []
-            for _ in range(5):
-                start = perf_counter()
-                model.get_outputs(cameras[middle : middle + 1])
-                synchronize()
-                times.append(perf_counter() - start)
-            rendering = median(times)
-            model.train()
-        count, decoder = self.config.max_num_iterations, model.semantic_field
-        seconds, words = rendering * count * RENDERINGS_PER_STEP[model.run.learns_from_renderings], 0.0
-        line = f"training: {roughly(seconds)} for {count:,} iterations"
-        if decoder is not None and decoder.needs_lifting:
-            words = rendering * len(cameras) * RENDERINGS_PER_PHOTO
-            words += decoder.learning_seconds(model.num_points)
-            line += f", then {roughly(words)} to learn words"
-        self.stages.weigh("words", "train", words / seconds if seconds else 1.0)
-        CONSOLE.log(f"{line}, more if Gaussians multiply")
+            line, words = estimate(self.pipeline.model.run, cameras, count)
+        self.stages.weigh("words", "train", words)
+        CONSOLE.log(line)
 
     def train_iteration(self, step: int):
         loss, losses, metrics = super().train_iteration(step)
         self._last_iteration = step
-        self.stages.progress((step + 1 - self._start_step) / self.config.max_num_iterations)
+        done = (step + 1 - self._start_step) / self.config.max_num_iterations
+        self.stages.progress(done, f"{self.pipeline.model.num_points:,} Gaussians")
         # nerfstudio keeps these through the next step, and what they were computed from with them.
         return loss.detach(), {name: value.detach() for name, value in losses.items()}, metrics
 
-    @contextmanager
-    def _stoppable(self) -> Iterator[None]:
-        """Let Ctrl-C or SIGTERM end training after the current iteration, with a checkpoint. Learning words,
-        which a checkpoint precedes, ends at once. A second signal ends anything at once."""
-        if threading.current_thread() is not threading.main_thread():  # only this thread may handle signals
-            yield
-            return
-
-        def stop(number: int, _frame: FrameType | None) -> None:
-            self.interrupted, self.stop_training = signal.Signals(number), True
-            signal.signal(number, previous[self.interrupted])
-            if self._is_learning_words:
-                raise _Stopped
-
-        # None stands for a handler that Python did not install, and cannot restore.
-        previous = {n: signal.getsignal(n) or signal.SIG_DFL for n in (signal.SIGINT, signal.SIGTERM)}
-        for number in previous:
-            signal.signal(number, stop)
-        try:
-            yield
-        finally:
-            for number, handler in previous.items():
-                signal.signal(number, handler)
+    def _stop(self, number: signal.Signals) -> None:
+        """End training after the current iteration, with a checkpoint. Learning words, which a checkpoint
+        precedes, ends at once."""
+        self.interrupted, self.stop_training = number, True
+        if self._is_learning_words:
+            raise _Stopped
 
     def _stop_early(self) -> str:
         """Save a checkpoint when training can't continue, and return a message about it."""
@@ -385,16 +351,12 @@ class Lang3DXLTrainer(Trainer):
     def _out_of_memory(self) -> str:
         """Describe what happened and what helps. The latest checkpoint is not replaced, since the interrupted
         step may have left incomplete tensors."""
-        count = self.pipeline.model.num_points
         when = "while learning words" if self._is_ending else f"at iteration {self.step}"
         saved, kept = max(self.checkpoint_dir.glob("step-*.ckpt"), default=None), "none is saved yet"
         if saved is not None:
             kept = f"{saved} is kept: --load-dir {self.checkpoint_dir} resumes there"
-        return (
-            f"out of memory {when} with {count:,} Gaussians. Three settings help: "
-            f"--pipeline.model.max-gaussians {count // 2}, --pipeline.datamanager.camera-res-scale-factor "
-            f"0.5, --pipeline.model.view-dependence off. The latest checkpoint: {kept}"
-        )
+        smaller = data_option("camera-res-scale-factor 0.5")
+        return out_of_memory(self.pipeline.model.num_points, when, smaller, kept)
 
     def _after_train(self) -> None:
         """Save, learn words, save again. If interrupted, print how to resume, and leave the viewer."""
@@ -457,7 +419,6 @@ class Lang3DXLTrainer(Trainer):
         """Write the checkpoint beside its folder and move it in, so that a killed run leaves no partial one.
         If it can't be written, training continues; at the end of training, UserError is raised."""
         path = self.checkpoint_dir / f"step-{step:09d}.ckpt"
-        partial = self.base_dir / f"{path.name}.partial"
         state = {
             "step": step,
             "pipeline": self.pipeline.state_dict(),
@@ -468,20 +429,11 @@ class Lang3DXLTrainer(Trainer):
             "words": self.words_are_learned,
         }
         try:
-            self.checkpoint_dir.mkdir(parents=True, exist_ok=True)
-            torch.save(state, partial)
-            replace_durably(partial, path)
-        except (OSError, RuntimeError) as error:  # torch raises RuntimeError for a full disk
-            with suppress(OSError):
-                partial.unlink(missing_ok=True)
-            free = shutil.disk_usage(self.base_dir).free / 1e9 if self.base_dir.is_dir() else 0.0
-            message = (
-                f"the checkpoint {path} can't be written ({error}; {free:.1f} GB are free): free some space; "
-                "earlier checkpoints are kept, and --load-dir resumes from the latest"
-            )
+            save_checkpoint(path, state, self.base_dir / f"{path.name}.partial")
+        except UserError as error:
             if self._is_ending:
-                raise UserError(message) from error
-            CONSOLE.log(f"[red]{escape(message)}. Training continues.[/red]")
+                raise
+            CONSOLE.log(f"[red]{escape(str(error))}. Training continues.[/red]")
             return
         if self.config.save_only_latest_checkpoint:
             for other in set(self.checkpoint_dir.glob("*.ckpt")) - {path}:

@@ -5,40 +5,32 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
-from time import perf_counter
 from typing import Any
 
-import torch
 from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from lang3dxl_ns.common.checks import check_address, check_numbers
 from lang3dxl_ns.common.console import say
-from lang3dxl_ns.common.device import best_device, unused_gpu, warn_of_unused_gpu
+from lang3dxl_ns.common.device import best_device, warn_of_unused_gpu
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import expanded
-from lang3dxl_ns.common.reports import synchronize
 from lang3dxl_ns.common.settings_help import showing
-from lang3dxl_ns.common.stages import roughly
 from lang3dxl_ns.files.runs import find_config
 from lang3dxl_ns.plugin.dataparser import PhotoCollectionDataParserConfig
 from lang3dxl_ns.plugin.inert_settings import check_inert
 from lang3dxl_ns.plugin.optimizers import RunAdamConfig, RunScheduleConfig
-from lang3dxl_ns.plugin.pipeline import Lang3DXLPipeline, Lang3DXLPipelineConfig, print_user_errors_plainly
+from lang3dxl_ns.plugin.pipeline import Lang3DXLPipeline, print_user_errors_plainly
 from lang3dxl_ns.plugin.run_checkpoint import check_checkpoint, latest_checkpoint
 from lang3dxl_ns.plugin.run_settings import load_configs, no_config, read_settings
-from lang3dxl_ns.plugin.trainer import RENDERINGS_PER_STEP, Lang3DXLTrainer, requested_checkpoint
+from lang3dxl_ns.plugin.trainer import Lang3DXLTrainer, RunConfig, requested_checkpoint
 from lang3dxl_ns.plugin.viewer_guard import ONLY_HERE
 from lang3dxl_ns.preparation.model_files import BUILTIN, check_encoders
 from lang3dxl_ns.preparation.needs import read_needs
-from lang3dxl_ns.rendering import Gaussians, gsplat_build, rasterize
-from lang3dxl_ns.scene.camera import Camera
 from lang3dxl_ns.scene.photo_folder import check_data
 from lang3dxl_ns.scene.record import SCENE_FILE
+from lang3dxl_ns.training.estimate import check_device
 from lang3dxl_ns.web.access import is_local
-
-LONG_RUN_S = 3_600.0
-"""Seconds of training on a slow GPU rasterizer above which a run is refused."""
 
 _OF_SCHEDULES = {**dict.fromkeys(("start", "end", "until"), (1e-9, 1e9)), "warm": (0, 1), "power": (0, 100)}
 
@@ -49,13 +41,10 @@ _OF_SCHEDULES = {**dict.fromkeys(("start", "end", "until"), (1e-9, 1e9)), "warm"
     *("machine", "viewer", "pipeline"),
 )
 @dataclass
-class Lang3DXLTrainerConfig(TrainerConfig):
+class Lang3DXLTrainerConfig(RunConfig):
     """Settings of a training run. `--max-num-iterations` alone rescales every schedule."""
 
     _target: type = field(default_factory=lambda: Lang3DXLTrainer)
-    pipeline: Lang3DXLPipelineConfig = field(default_factory=Lang3DXLPipelineConfig)
-    max_skipped_steps: int = 20
-    """Most steps in a row that are skipped, because loss or gradient is not finite, before the run stops."""
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Restore settings from config.yml, and tell the data manager the run's folder, known only here."""
@@ -105,30 +94,9 @@ class Lang3DXLTrainerConfig(TrainerConfig):
             raise UserError(f"{own} is of an earlier run: resume it with --load-dir, or change --timestamp")
         data = self.pipeline.datamanager
         check_encoders(data.clip, data.dense)
-        self._check_device()
+        check_device(self.machine.device_type, self.pipeline.model.rasterizer, self.max_num_iterations)
         if fresh:
             self._claim_folder()
-
-    def _check_device(self) -> None:
-        """Warn about an unused GPU, and build gsplat if it is needed, before anything is prepared."""
-        if self.machine.device_type == "cuda" and not torch.cuda.is_available():
-            raise UserError(f"torch can't use a GPU here: {unused_gpu() or 'there is none'}")
-        warn_of_unused_gpu()
-        rasterizer = self.pipeline.model.rasterizer
-        if self.machine.device_type == "cuda" and rasterizer == "gsplat":
-            gsplat_build.make_ready()
-        elif self.machine.device_type == "cuda" and rasterizer == "auto" and not gsplat_build.ready():
-            self._refuse_hours_of_torch()
-
-    def _refuse_hours_of_torch(self) -> None:
-        """Raise UserError if this GPU would take hours without gsplat, judged by one rendering."""
-        seconds = RENDERINGS_PER_STEP[False] * self.max_num_iterations * _torch_rendering_seconds()
-        if seconds > LONG_RUN_S:
-            raise UserError(
-                f"without gsplat (the warning above says what is missing) {self.max_num_iterations:,} "
-                f"iterations would take {roughly(seconds)} or more on this GPU: install what is missing, or "
-                "pass --pipeline.model.rasterizer torch to train with the slow rasterizer all the same"
-            )
 
     def _claim_folder(self) -> None:
         """Create a unique folder, even if two runs start in the same second."""
@@ -241,23 +209,6 @@ def open_run(run: str | Path | None) -> tuple[Lang3DXLTrainerConfig, Lang3DXLPip
     pipeline.load_pipeline(state["pipeline"], state["step"])
     CONSOLE.log(f"Loaded {path}")
     return config, pipeline, state["step"]
-
-
-def _torch_rendering_seconds(count: int = 50_000, size: tuple[int, int] = (1000, 700)) -> float:
-    """Measure the seconds of the second rendering, which is warm, of random Gaussians by torch on the GPU."""
-    draw = torch.Generator().manual_seed(0)
-    means = torch.rand(count, 3, generator=draw) * 4 - torch.tensor([2.0, 2.0, -3.0])
-    quats = torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1)
-    parts = means, quats, torch.full((count, 3), 0.02), torch.full((count,), 0.5)
-    gaussians = Gaussians(*(part.to("cuda") for part in parts))
-    lens = torch.tensor([[900.0, 0.0, size[0] / 2], [0.0, 900.0, size[1] / 2], [0.0, 0.0, 1.0]])
-    camera, seconds = Camera(torch.eye(4), lens, *size), 0.0
-    for _ in range(2):
-        start = perf_counter()
-        rasterize(gaussians, camera, torch.ones(count, 3, device="cuda"), backend="torch")
-        synchronize()
-        seconds = perf_counter() - start
-    return seconds
 
 
 def _absolute(path: Path | None) -> Path | None:

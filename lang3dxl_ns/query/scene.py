@@ -367,8 +367,8 @@ class Scene:
         index: str | Path | None = None,
         hide_floaters: bool = False,
     ) -> int:
-        """Write the Gaussians as a .ply or .spz file for splat viewers, in the scene's order, and return how
-        many were written.
+        """Write the Gaussians as a .ply, .spz, .sog or .glb file for splat viewers, in the scene's order, and
+        return how many were written.
 
         Args:
             text: prompt; only the Gaussians that match it are written. None: all Gaussians are written.

@@ -88,8 +88,9 @@ def _vertices(file: BinaryIO, size: int) -> Any:
         expect(len(numbers) == count * len(columns), "it announces more vertices than it holds")
         table = numbers.reshape(count, len(columns))
         rows = np.zeros(count, row)
-        for i, (name, _) in enumerate(columns):
-            rows[name] = table[:, i]
+        with np.errstate(invalid="ignore", over="ignore"):  # text may hold any number
+            for i, (name, _) in enumerate(columns):
+                rows[name] = table[:, i]
         return rows
     expect(count * row.itemsize <= size - end.end(), "it announces more vertices than it holds")
     return np.frombuffer(file.read(count * row.itemsize), row)

@@ -6,6 +6,7 @@ import pickle
 from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
+from shutil import disk_usage
 from typing import Any
 
 import torch
@@ -17,18 +18,21 @@ CHECKPOINT = "training.ckpt"
 """Name of the checkpoint in a run's folder."""
 
 
-def save_checkpoint(path: Path, content: Mapping[str, Any]) -> None:
-    """Write a checkpoint beside its place and move it in, so that a killed run keeps the one before. Raises
-    UserError if it can't be written; the one before is kept then, too."""
-    partial = path.with_name(f"{path.name}.partial")
+def save_checkpoint(path: Path, content: Mapping[str, Any], partial: Path | None = None) -> None:
+    """Write a checkpoint beside its place, or at `partial`, and move it in, so that a killed run keeps the
+    one before. Raises UserError if it can't be written; earlier ones are kept then, too."""
+    partial = partial or path.with_name(f"{path.name}.partial")
     try:
+        path.parent.mkdir(parents=True, exist_ok=True)
         torch.save(dict(content), partial)
         replace_durably(partial, path)
     except (OSError, RuntimeError) as error:  # torch raises RuntimeError for a full disk
         with suppress(OSError):
             partial.unlink(missing_ok=True)
+        place = next(folder for folder in path.absolute().parents if folder.is_dir())
         raise UserError(
-            f"{path} can't be written ({error}): free some space; the one before is kept"
+            f"the checkpoint {path} can't be written ({error}; {disk_usage(place).free / 1e9:.1f} GB are "
+            "free): free some space; earlier checkpoints are kept, and the run resumes from the latest"
         ) from error
 
 

@@ -3,14 +3,10 @@
 from __future__ import annotations
 
 import functools
-import signal
 import threading
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import FrameType
 from typing import Any, Literal
 
 import torch
@@ -20,7 +16,9 @@ from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.device import best_device
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import expanded
+from lang3dxl_ns.common.memory import ran_out_of_memory
 from lang3dxl_ns.common.stages import Stages
+from lang3dxl_ns.common.stopping import stoppable
 from lang3dxl_ns.files.scene_file import SUFFIX, Provenance, replace_scene
 from lang3dxl_ns.preparation.model_files import check_encoders
 from lang3dxl_ns.preparation.needs import needs_table
@@ -31,9 +29,10 @@ from lang3dxl_ns.scene.companions import cache_folder
 from lang3dxl_ns.scene.photo_folder import check_data
 from lang3dxl_ns.training.batches import TrainingData, settle
 from lang3dxl_ns.training.checkpoint import CHECKPOINT, read_checkpoint, save_checkpoint
+from lang3dxl_ns.training.estimate import check_device, estimate
 from lang3dxl_ns.training.learn_codes import forget_words, learn_words
 from lang3dxl_ns.training.learning_rates import Rates, learning_rates, printed_learning_rates
-from lang3dxl_ns.training.memory import plan
+from lang3dxl_ns.training.memory import out_of_memory, plan
 from lang3dxl_ns.training.settings import PRINTED_PHOTO_SCALE, TrainingSettings, as_printed
 from lang3dxl_ns.training.snapshot import snapshot
 from lang3dxl_ns.training.state import Training
@@ -208,24 +207,51 @@ class Run:
         if self.is_finished and self.path.exists():
             say("The run is finished already")
             return self.scene()
-        steps = self.settings.steps
-        every, scene = min(self.settings.save_every, max(steps // 4, 1)), None
-        with stages.stage("train"), _stoppable() as stop:
-            for step in range(self.start, steps):
-                self.iterate(step)
-                stages.progress((step + 1 - self.start) / (steps - self.start))
-                if stop.is_set() or step == steps - 1 or (step + 1) % every == 0:
-                    scene = self.save(step)
-                if stop.is_set():
-                    say(f"Stopped after {step + 1} iterations. To resume: the same command")
-                    raise KeyboardInterrupt
-        if self.state.learns_words_at_the_end and not self.words_are_learned:
-            with stages.stage("words"):
-                self.learn_words()
-            self.words_are_learned, scene = True, None
+        try:
+            self._train(stages)
+            if self.state.learns_words_at_the_end and not self.words_are_learned:
+                self._end_with_words(stages)
+        except (RuntimeError, MemoryError) as error:
+            if not ran_out_of_memory(error):
+                raise
+            kept = self.folder / CHECKPOINT
+            told = f"{kept} is kept: the same command resumes there" if kept.exists() else "none is saved yet"
+            when = f"at iteration {self.state.step}"
+            raise UserError(out_of_memory(len(self.state.means), when, "--photo-scale 0.5", told)) from error
         if summary := self.guard.summary():
             say(summary)
-        return scene or self.save(steps - 1)
+        return self.save(self.settings.steps - 1)
+
+    def _train(self, stages: Stages) -> None:
+        """Do the iterations that are left, with a checkpoint now and then and after the last one."""
+        steps, asked = self.settings.steps, threading.Event()
+        every = min(self.settings.save_every, max(steps // 4, 1))
+        if self.start < steps:
+            line, words = estimate(self.state, self.data.cameras, steps - self.start)
+            stages.weigh("words", "train", words)
+            say(line)
+        with stages.stage("train"), stoppable(lambda _: asked.set()):
+            for step in range(self.start, steps):
+                self.iterate(step)
+                done = (step + 1 - self.start) / (steps - self.start)
+                stages.progress(done, f"{len(self.state.means):,} Gaussians")
+                ends = step == steps - 1  # with a checkpoint only if words follow
+                due = self.state.learns_words_at_the_end if ends else (step + 1) % every == 0
+                if asked.is_set() or due:
+                    self.save(step)
+                if asked.is_set():
+                    say(f"Stopped after {step + 1} iterations. To resume: the same command")
+                    raise KeyboardInterrupt
+
+    def _end_with_words(self, stages: Stages) -> None:
+        """Learn words, which a checkpoint precedes."""
+        try:
+            with stages.stage("words"):
+                self.learn_words()
+        except KeyboardInterrupt:
+            say("Stopped while words were learned; all iterations are kept. To resume: the same command")
+            raise
+        self.words_are_learned = True
 
 
 def begin(capture: Capture, settings: Settings, out: Path, cache_dir: Path, device: str | None = None) -> Run:
@@ -233,9 +259,11 @@ def begin(capture: Capture, settings: Settings, out: Path, cache_dir: Path, devi
     # A group without gradients so far has a schedule all the same.
     warnings.filterwarnings("ignore", "Detected call of .lr_scheduler.step")
     settings.resolve()
+    device = device or best_device()
+    check_device(device, settings.scene.rasterizer, settings.steps)
     out.mkdir(parents=True, exist_ok=True)
     torch.manual_seed(settings.seed)
-    run = Run(capture, settings, out, cache_dir, device or best_device())
+    run = Run(capture, settings, out, cache_dir, device)
     run.resume()
     return run
 
@@ -258,28 +286,6 @@ def fit(capture: Capture, settings: Settings, out: Path, cache_dir: Path, device
     with stages.stage("prepare"):
         run = begin(capture, settings, out, cache_dir, device)
     return run.complete(stages)
-
-
-@contextmanager
-def _stoppable() -> Iterator[threading.Event]:
-    """Yield an event that the first Ctrl-C or SIGTERM sets; a second one acts at once."""
-    stop = threading.Event()
-    if threading.current_thread() is not threading.main_thread():  # only this thread may handle signals
-        yield stop
-        return
-    before = {n: signal.getsignal(n) or signal.SIG_DFL for n in (signal.SIGINT, signal.SIGTERM)}
-
-    def asked(number: int, _frame: FrameType | None) -> None:
-        stop.set()
-        signal.signal(number, before[signal.Signals(number)])
-
-    for number in before:
-        signal.signal(number, asked)
-    try:
-        yield stop
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 def run_folder(

@@ -6,6 +6,7 @@ import torch
 
 from lang3dxl_ns.common.kernels import MOST_SUMS
 from lang3dxl_ns.common.memory import machine_memory
+from lang3dxl_ns.common.options import model_option
 from lang3dxl_ns.training.state import Training
 
 PER_PARAMETER = 16.0
@@ -70,4 +71,14 @@ def plan(run: Training, pixels: int, device: torch.device, wanted: int | None) -
         f"memory of {where}: about {(fixed + now * each) / 1e9:.1f} GB with the first {now:,} Gaussians, "
         f"{each * 1e6 / 1e9:.1f} GB per million more; {memory / 1e9:.1f} GB to plan with, "
         f"{limit} (max-gaussians)"
+    )
+
+
+def out_of_memory(count: int, when: str, smaller: str, kept: str) -> str:
+    """Describe that memory ran out with this number of Gaussians, and what helps. `smaller`: the option that
+    halves the photos. `kept`: what is kept of the run."""
+    fewer, plainer = model_option(f"max-gaussians {count // 2}"), model_option("view-dependence off")
+    return (
+        f"out of memory {when} with {count:,} Gaussians. Three settings help: {fewer}, {smaller}, {plainer}. "
+        f"The latest checkpoint: {kept}"
     )

@@ -13,7 +13,6 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.device import to_device
 from lang3dxl_ns.common.image import fitted_size, resize_nearest
 from lang3dxl_ns.common.reports import part
@@ -147,10 +146,7 @@ def finish(run: Training) -> None:
     Gaussians in bounds, and write the sky's colors."""
     g, step, seen, run.seen = run.gaussians, run.step, run.seen, {}
     if step > 0 and run.step_is_sound:
-        before = len(g["means"])
         run.densification.after_backward(g, run.optimizers, run.statistics, step, seen)
-        if len(g["means"]) != before:
-            say(f"Step {step}: {before} → {len(g['means'])} Gaussians")
     degree, still = run.settings.sh_degree, run.densification.still
     if step % EVERY == 0 or step + 1 == run.settings.total_steps:
         keep_in_bounds(g, *run.extent, still, degree)

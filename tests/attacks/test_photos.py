@@ -184,7 +184,7 @@ def change_points(folder, xyz):
 def test_training_without_usable_points_says_so(folder, xyz, tiny_clip, tiny_dense, tmp_path):
     change_points(folder, xyz)
     trainer = make_trainer(folder, tiny_clip, tiny_dense, tmp_path / "out", 2, semantics=False)
-    with pytest.raises(UserError, match=r"has 0 3D points.*--pipeline\.model\.random-init True"):
+    with pytest.raises(UserError, match=r"has 0 3D points.*--random-init True"):
         trainer.setup()
 
 

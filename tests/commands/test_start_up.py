@@ -13,7 +13,7 @@ HEAVY = {
     *("torch", "torchvision", "nerfstudio", "gsplat", "viser", "transformers", "sklearn", "scipy", "skimage"),
     *("matplotlib", "pycolmap", "cv2", "numba", "ray"),
 }
-OF_TORCH = {"query", "export", "train"}
+OF_TORCH = {"query", "export"}
 """Commands whose settings are still defined beside work that needs torch."""
 HELP = """
 import io, json, sys

@@ -75,7 +75,7 @@ def test_every_property_of_a_ply_is_in_its_place(tmp_path):
     np.testing.assert_array_equal(rows["f_dc_2"], splats.harmonics[:, 0, 2])
     for channel in range(3):
         np.testing.assert_array_equal(rows[f"f_rest_{3 * channel}"], splats.harmonics[:, 1, channel])
-    with pytest.raises(UserError, match=r"end it in .ply or .spz"):
+    with pytest.raises(UserError, match=r"end it in .ply, .spz, .sog or .glb"):
         write_splats(tmp_path / "all.obj", splats)
 
 
@@ -443,7 +443,7 @@ def test_our_spz_is_what_gsply_reads(tmp_path):
     np.testing.assert_allclose(found.harmonics[:, 1:], other.shN, atol=1e-6)
 
 
-@pytest.mark.parametrize("ending", ["ply", "spz"])
+@pytest.mark.parametrize("ending", ["ply", "spz", "sog", "glb"])
 @pytest.mark.parametrize("antialiased", [False, True])
 def test_antialiasing_is_written_and_read_back(ending, antialiased, tmp_path):
     write_splats(tmp_path / f"a.{ending}", replace(some_splats(), antialiased=antialiased))
@@ -545,7 +545,7 @@ def test_a_refusal_names_version_degree_type_or_column(name, content, said, tmp_
     assert "damaged" not in str(error.value)
 
 
-@pytest.mark.parametrize("kind", ["ply", "ascii.ply", "spz", "4.spz", "splat"])
+@pytest.mark.parametrize("kind", ["ply", "ascii.ply", "spz", "4.spz", "sog", "glb", "splat"])
 def test_mutated_files_are_read_or_refused_in_one_sentence(kind, tmp_path):
     """100 mutations of each: bytes changed, cut, doubled, or their numbers made large."""
     gsply = pytest.importorskip("gsply")

@@ -14,9 +14,8 @@ from lang3dxl_ns.plugin.conversation import Conversation
 @pytest.fixture
 def model():
     """One whose snapshots have fewer Gaussians at every iteration."""
-    found = SimpleNamespace(step=1, training=True, device="cpu", semantic_field=None)
-    found.config, found.train = SimpleNamespace(total_steps=10), lambda _: None
-    found.forget_gathered_codes = lambda: None
+    found = SimpleNamespace(step=1, training=True, device="cpu", learns_words_at_the_end=False)
+    found.settings = SimpleNamespace(total_steps=10)
 
     def snapshot(*_, **settings):
         keep = torch.arange(len(painted_splats())) < 5000 - 500 * found.step
@@ -29,6 +28,8 @@ def model():
 @pytest.fixture
 def talk(model, monkeypatch, tmp_path):
     monkeypatch.setattr(module, "text_encoder", lambda *_: encode_texts)
+    monkeypatch.setattr(module, "snapshot", model.scene)
+    monkeypatch.setattr(module, "forget_words", lambda _: None)
     nothing = {"learn": lambda: None, "shown": set, "watch": lambda _: None}
     learning = lambda: model.training  # noqa: E731
     return Conversation(model, None, tmp_path, nullcontext(), learning, **nothing)
@@ -76,12 +77,12 @@ def test_a_question_that_comes_while_a_frame_is_rendered_waits_for_the_next(talk
     assert "relevancy_1" in found and set(frame(talk, model)) == {"overlay"}
 
 
-def test_a_question_that_waited_while_the_final_words_were_learned_keeps_them(talk, model):
+def test_a_question_that_waited_while_the_final_words_were_learned_keeps_them(talk, model, monkeypatch):
     """The words of the end are learned under the lock that the snapshot waits for: it must not learn its own
     over them, nor delete them afterwards."""
     told = []
-    model.semantic_field = SimpleNamespace(needs_lifting=True)
-    model.forget_gathered_codes = lambda: told.append("forgotten")
+    model.learns_words_at_the_end = True
+    monkeypatch.setattr(module, "forget_words", lambda _: told.append("forgotten"))
     talk.learn = lambda: told.append("learned")
 
     @contextmanager

@@ -5,6 +5,7 @@ import shutil
 
 import numpy as np
 import pytest
+import torch
 from conftest import make_trainer
 from label_sets import box_object, write_labels, write_plain
 from PIL import Image
@@ -14,6 +15,7 @@ from lang3dxl_ns import cli
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth, find_ground_truth
 from lang3dxl_ns.evaluation.score_scene import score_scene
+from lang3dxl_ns.files.scene_file import write_scene as write_scene_file
 from lang3dxl_ns.plugin.dataparser import PhotoCollectionDataParserConfig
 from lang3dxl_ns.plugin.load_scene import load_run
 from lang3dxl_ns.plugin.trainer_config import open_run
@@ -21,6 +23,7 @@ from lang3dxl_ns.scene.camera import Lens
 from lang3dxl_ns.scene.capture import Capture, CaptureSettings
 from lang3dxl_ns.scene.colmap import Reconstruction
 from lang3dxl_ns.scene.photo import Photo
+from lang3dxl_ns.words.taught_words import TaughtWord
 
 
 def label(scene, folder, numbers):
@@ -133,6 +136,32 @@ def test_evaluate_run_writes_the_report_of_a_run(trainer, scene, tmp_path):
     report = json.loads((tmp_path / "out" / "scores.json").read_text())
     assert list(report["results"]["photos"]) == ["photo_001.jpg"]
     assert "| dome | 1 |" in (tmp_path / "out" / "scores.md").read_text()
+    assert "taught_words_left_out" not in report["results"]["protocol"]
+
+
+def test_a_run_is_scored_by_text_alone_and_says_which_taught_words_that_leaves_out(
+    trainer, scene, tmp_path, capsys, monkeypatch
+):
+    run = tmp_path / "outputs" / "a" / "lang3dxl" / "first"
+    shutil.copytree(trainer.base_dir, run)
+    for file in run.glob("*.scene"):
+        file.unlink()
+    loaded = load_run(trainer.base_dir)
+    word = TaughtWord(
+        "gizmo", torch.ones(loaded.decoder.clip_dim), 0.0, 0.0, 0.1, clip=loaded.file.clip_identity
+    )
+    write_scene_file(run / "a.scene", loaded.with_words([word]))
+    truth, figures = label(scene, tmp_path / "truth", (0, 1)), []
+    monkeypatch.chdir(tmp_path)
+    for named in (str(trainer.base_dir), str(run), None):  # None: the newest below outputs/
+        words = ["evaluate", "run", *filter(None, [named]), "--ground-truth", str(truth), "--split", "seen"]
+        cli.main([*words, "--out", str(tmp_path / "out")])
+        results = json.loads((tmp_path / "out" / "scores.json").read_text())["results"]
+        figures.append(results["photos"]["photo_001.jpg"]["ap_dome"])
+        told = "what examples taught (gizmo) counts where the .scene file is named" in capsys.readouterr().out
+        left_out = results["protocol"].get("taught_words_left_out", [])
+        assert (left_out, told) == (([], False) if named == str(trainer.base_dir) else (["gizmo"], True))
+    assert figures == pytest.approx(figures[:1] * 3)
 
 
 # ── held-out photos by list ─────────────────────────────────────────────────────────────────────────────

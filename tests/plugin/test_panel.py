@@ -196,7 +196,7 @@ def test_while_the_model_learns_its_words_are_gathered_when_they_are_asked_for(t
         model.gauss_params["codes"] = codes
 
     conversation = session.Conversation(
-        model,
+        model.run,
         trainer.pipeline.scene_file,
         trainer.base_dir,
         trainer.train_lock,

@@ -149,7 +149,7 @@ def test_components_left_out_are_absent(train, scene, tmp_path):
     assert model.semantic_field.dense_dim == 0
     assert not {"dense_target", "regions", "mask"} & set(batch)
     assert not [name for name in model.state_dict() if "appearance" in name or "camera" in name]
-    store = trainer.pipeline.datamanager.cache_dir
+    store = trainer.pipeline.datamanager.data.cache_dir
     assert not (store / "regions").exists()
 
 

@@ -1,6 +1,7 @@
 """`fit`: the same bytes as `ns-train`, also after a stop; what a run leaves in its folder."""
 
 import os
+import re
 import signal
 from pathlib import Path
 
@@ -86,6 +87,48 @@ def test_a_run_that_was_stopped_ends_with_the_same_bytes(data, settings, tmp_pat
         trained(data, tmp_path / "again", settings())
     monkeypatch.setattr(Run, "iterate", iterate)
     assert differing(whole, trained(data, tmp_path / "again", settings())) == []
+
+
+def test_words_that_are_stopped_are_said_and_made_by_the_next_command(
+    data, settings, tmp_path, monkeypatch, capsys
+):
+    whole, learn = trained(data, tmp_path / "whole", settings(4)), fitting.learn_words
+
+    def stopped(*arguments):
+        signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(fitting, "learn_words", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        trained(data, tmp_path / "again", settings(4))
+    assert "Stopped while words were learned; all iterations are kept" in capsys.readouterr().out
+    monkeypatch.setattr(fitting, "learn_words", learn)
+    assert differing(whole, trained(data, tmp_path / "again", settings(4))) == []
+
+
+def test_a_full_memory_names_settings_that_help_and_the_checkpoint(data, settings, tmp_path, monkeypatch):
+    iterate = Run.iterate
+
+    def full(self, step):
+        if step == 2:
+            raise RuntimeError("CUDA out of memory")
+        iterate(self, step)
+
+    monkeypatch.setattr(Run, "iterate", full)
+    monkeypatch.setattr("sys.argv", ["lang3dxl"])
+    said = (
+        r"at iteration 1 .* --max-gaussians \d+, --photo-scale 0.5, .*training.ckpt is kept: the same command"
+    )
+    with pytest.raises(UserError, match=said):
+        trained(data, tmp_path, settings(4))
+
+
+def test_the_time_is_estimated_before_and_the_number_of_gaussians_is_no_noise(
+    data, settings, tmp_path, capsys
+):
+    trained(data, tmp_path, settings())
+    said = capsys.readouterr().out
+    assert re.search(r"training: about \d+ seconds for 20 iterations, then about .* to learn words", said)
+    assert "→" not in said
 
 
 def test_a_scene_of_a_resumed_run_has_all_its_colors(data, settings, tmp_path):

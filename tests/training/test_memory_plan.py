@@ -8,6 +8,7 @@ import torch
 
 from lang3dxl_ns.common.stages import roughly
 from lang3dxl_ns.plugin import trainer as trainers
+from lang3dxl_ns.training import estimate
 from lang3dxl_ns.training import memory as sizes
 from lang3dxl_ns.training.parts import Parts
 
@@ -56,11 +57,11 @@ def test_the_time_of_training_is_told_before_it_and_telling_changes_nothing(scen
     said: list[str] = []
     monkeypatch.setattr(trainers.CONSOLE, "log", said.append)
     ticks = iter(range(1000))
-    monkeypatch.setattr(trainers, "perf_counter", lambda: next(ticks))  # a rendering takes a second
+    monkeypatch.setattr(estimate, "perf_counter", lambda: next(ticks))  # a rendering takes a second
     trainer = train(scene, iterations=2)
     (line,) = (line for line in said if "Gaussians multiply" in line)
     photos = len(trainer.pipeline.datamanager.train_dataset)
-    words = roughly(photos * trainers.RENDERINGS_PER_PHOTO + 0.1)
+    words = roughly(photos * estimate.RENDERINGS_PER_PHOTO + 0.1)
     start = f"training: about 10 seconds for 2 iterations, then {words} to learn words"
     assert line == f"{start}, more if Gaussians multiply"
     model, random = trainer.pipeline.model.train(), torch.get_rng_state()

@@ -1,0 +1,33 @@
+"""Ctrl-C and SIGTERM as a wish that work may end at a good place."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from types import FrameType
+
+
+@contextmanager
+def stoppable(stop: Callable[[signal.Signals], None]) -> Iterator[None]:
+    """Call `stop` at the first Ctrl-C or SIGTERM; a second one acts at once. In other threads than the main
+    one, which alone may handle signals, nothing changes."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    # None stands for a handler that Python did not install, and cannot restore.
+    before = {n: signal.getsignal(n) or signal.SIG_DFL for n in (signal.SIGINT, signal.SIGTERM)}
+
+    def asked(number: int, _frame: FrameType | None) -> None:
+        found = signal.Signals(number)
+        signal.signal(number, before[found])
+        stop(found)
+
+    for number in before:
+        signal.signal(number, asked)
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

@@ -1,0 +1,169 @@
+"""GLB, glTF's binary form, with splats (KHR_gaussian_splatting) and, if asked for, the whole scene.
+
+A scene's record is a scene file in a buffer view of its own, which other readers skip.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Iterator
+from math import isqrt
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch.nn.functional as F
+from jaxtyping import Float32, Shaped
+from numpy import ndarray as Array
+
+from lang3dxl_ns.common.checks import expect
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.files.activations import ALL_BANDS, array_of, check_memory, tensor_of
+from lang3dxl_ns.rendering import Splats
+
+SUFFIX = ".glb"
+_SPLATS, _RECORD = "KHR_gaussian_splatting", "LANG3DXL_scene"
+_HEADER, _CHUNK = struct.Struct("<4sII"), struct.Struct("<I4s")
+_FLOAT, _POINTS, _ARRAY_BUFFER = 5126, 0, 34962
+_KINDS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", _FLOAT: "<f4"}
+_SIDES = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
+_MOST_DEGREE = 3
+
+
+def encode_glb(splats: Splats, record: bytes | None = None) -> bytes:
+    """Encode splats, in their own frame and units. record: content of the scene's file."""
+    content, views, accessors, named = bytearray(), list[dict[str, Any]](), list[dict[str, Any]](), {}
+    for name, values in _attributes(splats):
+        named[name] = len(accessors)
+        kind = next(
+            kind for kind, side in _SIDES.items() if side == (values.shape[1] if values.ndim > 1 else 1)
+        )
+        accessor = {"bufferView": len(views), "componentType": _FLOAT, "count": len(values), "type": kind}
+        if name == "POSITION":
+            accessor |= {"min": values.min(0).tolist(), "max": values.max(0).tolist()}
+        views.append({"byteOffset": len(content), "byteLength": values.nbytes, "target": _ARRAY_BUFFER})
+        accessors.append(accessor)
+        content += values.astype("<f4").tobytes()
+    about = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
+    primitive = {"mode": _POINTS, "attributes": named, "extensions": {_SPLATS: about}}
+    described: dict[str, Any] = {
+        "asset": {"version": "2.0", "generator": "lang3dxl-ns"},
+        "extensionsUsed": [_SPLATS],
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [primitive | {"extras": {"antialiased": splats.antialiased}}]}],
+    }
+    if record is not None:
+        described["extensionsUsed"].append(_RECORD)
+        described["extensions"] = {_RECORD: {"bufferView": len(views)}}
+        views.append({"byteOffset": len(content), "byteLength": len(record)})
+        content += record
+    content += bytes(-len(content) % 4)
+    described |= {"accessors": accessors, "bufferViews": [{"buffer": 0, **view} for view in views]}
+    described["buffers"] = [{"byteLength": len(content)}]
+    text = json.dumps(described, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 4)
+    size = _HEADER.size + 2 * _CHUNK.size + len(text) + len(content)
+    if size >= 2**32:
+        raise UserError(f"a .glb holds 4 GB, and these {len(splats):,} Gaussians need more: write a .ply")
+    chunks = (_CHUNK.pack(len(text), b"JSON"), text, _CHUNK.pack(len(content), b"BIN\0"), bytes(content))
+    return _HEADER.pack(b"glTF", 2, size) + b"".join(chunks)
+
+
+def _attributes(splats: Splats) -> Iterator[tuple[str, Float32[Array, "n ..."]]]:
+    yield "POSITION", array_of(splats.means)
+    yield f"{_SPLATS}:ROTATION", np.roll(array_of(F.normalize(splats.quats, dim=1)), -1, axis=1)
+    yield f"{_SPLATS}:SCALE", array_of(splats.scales)
+    yield f"{_SPLATS}:OPACITY", array_of(splats.opacities.clamp(0, 1))
+    for band in range(splats.harmonics.shape[1]):
+        yield _harmonic(band), array_of(splats.harmonics[:, band])
+
+
+def _harmonic(band: int) -> str:
+    degree = isqrt(band)
+    return f"{_SPLATS}:SH_DEGREE_{degree}_COEF_{band - degree**2}"
+
+
+class _Glb:
+    """Content of a file: its description, and its binary part."""
+
+    def __init__(self, path: Path) -> None:
+        content = path.read_bytes()
+        expect(len(content) >= _HEADER.size + _CHUNK.size, "it is cut short")
+        magic, version, size = _HEADER.unpack_from(content)
+        expect(magic == b"glTF" and version == 2, "it doesn't begin like a GLB of version 2")
+        expect(size <= len(content), "it is cut short")
+        chunks, place = dict[bytes, memoryview](), _HEADER.size
+        while place + _CHUNK.size <= size:
+            length, kind = _CHUNK.unpack_from(content, place)
+            place += _CHUNK.size
+            expect(length <= size - place, "it is cut short")
+            chunks.setdefault(kind, memoryview(content)[place : place + length])
+            place += length
+        self.binary = chunks.get(b"BIN\0", memoryview(b""))
+        self.about: dict[str, Any] = json.loads(bytes(chunks[b"JSON"]))
+
+    def view(self, number: int) -> memoryview:
+        """Return the bytes of a buffer view."""
+        view = self.about["bufferViews"][number]
+        start, size = view.get("byteOffset", 0), view["byteLength"]
+        inside = isinstance(start, int) and isinstance(size, int) and 0 <= start <= start + size
+        expect(inside and start + size <= len(self.binary), "a part lies outside of it")
+        expect(view["buffer"] == 0 and "byteStride" not in view, "its parts are interleaved, or other files")
+        return self.binary[start : start + size]
+
+    def values(self, number: int, side: int) -> Float32[Array, "n side"]:
+        """Return the values of an accessor, `side` of them a row."""
+        accessor = self.about["accessors"][number]
+        kind, count, offset = (
+            _KINDS[accessor["componentType"]],
+            accessor["count"],
+            accessor.get("byteOffset", 0),
+        )
+        expect(_SIDES[accessor["type"]] == side and "sparse" not in accessor, "an attribute has another form")
+        content = self.view(accessor["bufferView"])
+        size = count * side * np.dtype(kind).itemsize
+        expect(0 <= offset <= offset + size <= len(content), "an attribute is cut short")
+        values: Shaped[Array, " m"] = np.frombuffer(content[offset : offset + size], kind)
+        largest = np.iinfo(values.dtype).max if accessor.get("normalized") else 1
+        return (values.astype(np.float32) / np.float32(largest)).reshape(count, side)
+
+
+def read_glb(path: Path) -> Splats:
+    """Read the first splats of a file, in the frame of their own node. Raises UserError if it has none, or
+    they are compressed, and one of `DAMAGE` for a damaged file."""
+    file = _Glb(path)
+    meshes = (primitive for mesh in file.about.get("meshes", []) for primitive in mesh["primitives"])
+    found = next((one for one in meshes if _SPLATS in one.get("extensions", {})), None)
+    if found is None:
+        raise UserError(f"it holds no splats ({_SPLATS}): export it as a splat")
+    named = found["attributes"]
+    if found["extensions"][_SPLATS].get("extensions"):
+        raise UserError("its splats are compressed by another extension: export them without compression")
+    degree = max(d for d in range(_MOST_DEGREE + 1) if _harmonic(d**2) in named)
+    check_memory(file.about["accessors"][named["POSITION"]]["count"], ALL_BANDS)
+    parts = [file.values(named[name], 3) for name in ("POSITION", f"{_SPLATS}:SCALE")]
+    quats = np.roll(file.values(named[f"{_SPLATS}:ROTATION"], 4), 1, axis=1)
+    opacities = file.values(named[f"{_SPLATS}:OPACITY"], 1)[:, 0]
+    harmonics = np.stack(
+        [file.values(named[_harmonic(band)], 3) for band in range((degree + 1) ** 2)], axis=1
+    )
+    expect(
+        {len(part) for part in (*parts, quats, opacities)} == {len(harmonics)},
+        "its attributes differ in size",
+    )
+    antialiased = bool((found.get("extras") or {}).get("antialiased", False))
+    means, scales = map(tensor_of, parts)
+    return Splats(means, tensor_of(quats), scales, tensor_of(opacities), tensor_of(harmonics), antialiased)
+
+
+def scene_record(path: Path) -> bytes:
+    """Return the content of the scene file in a file. Raises UserError if there is none, and one of `DAMAGE`
+    for a damaged file."""
+    file = _Glb(path)
+    record = file.about.get("extensions", {}).get(_RECORD)
+    if record is None:
+        raise UserError("it holds splats without words; lang3dxl attach makes a scene of them")
+    return bytes(file.view(record["bufferView"]))

@@ -1,0 +1,152 @@
+"""GLB and SOG: what is written is read back, as the formats say, and a GLB carries words."""
+
+import io
+import json
+import struct
+import zipfile
+
+import numpy as np
+import pytest
+import torch
+import torch.nn.functional as F
+from painted_scene import encode_texts, painted_scene
+from PIL import Image
+from test_scene_file import decoded
+
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.files.read_splats import read_splats
+from lang3dxl_ns.files.scene_file import keep_words, read_scene, write_scene
+from lang3dxl_ns.files.splat_file import write_splats
+from lang3dxl_ns.rendering import Splats
+
+
+def some_splats(count: int = 200, bands: int = 4, antialiased: bool = True) -> Splats:
+    g = torch.Generator().manual_seed(0)
+    quats = F.normalize(torch.randn(count, 4, generator=g), dim=1)
+    scales, opacities = 0.02 + torch.rand(count, 3, generator=g), torch.rand(count, generator=g)
+    means, colors = 4 * torch.randn(count, 3, generator=g), torch.rand(count, bands, 3, generator=g) - 0.5
+    return Splats(means, quats, scales, opacities, colors, antialiased)
+
+
+def described(path) -> tuple[dict, bytes]:
+    """The JSON of a GLB and its binary part."""
+    content = path.read_bytes()
+    size = struct.unpack_from("<I", content, 12)[0]
+    return json.loads(content[20 : 20 + size]), content[28 + size :]
+
+
+@pytest.mark.parametrize("bands", [1, 4, 9, 16])
+def test_a_glb_is_read_back(bands, tmp_path):
+    splats = some_splats(bands=bands)
+    write_splats(tmp_path / "a.glb", splats)
+    found = read_splats(tmp_path / "a.glb")
+    for name in ("means", "scales", "opacities", "harmonics", "quats"):
+        torch.testing.assert_close(getattr(found, name), getattr(splats, name), atol=1e-6, rtol=0)
+    assert found.antialiased
+
+
+def test_a_glb_has_the_attributes_of_the_extension(tmp_path):
+    splats = some_splats(3)
+    write_splats(tmp_path / "a.glb", splats)
+    about, binary = described(tmp_path / "a.glb")
+    primitive = about["meshes"][0]["primitives"][0]
+    assert primitive["mode"] == 0 and about["extensionsUsed"] == ["KHR_gaussian_splatting"]
+    assert primitive["extensions"]["KHR_gaussian_splatting"]["kernel"] == "ellipse"
+    for name, wanted in {
+        "POSITION": splats.means,
+        "KHR_gaussian_splatting:ROTATION": splats.quats[:, [1, 2, 3, 0]],
+        "KHR_gaussian_splatting:SCALE": splats.scales,
+        "KHR_gaussian_splatting:OPACITY": splats.opacities,
+        "KHR_gaussian_splatting:SH_DEGREE_0_COEF_0": splats.harmonics[:, 0],
+        "KHR_gaussian_splatting:SH_DEGREE_1_COEF_2": splats.harmonics[:, 3],
+    }.items():
+        accessor = about["accessors"][primitive["attributes"][name]]
+        view = about["bufferViews"][accessor["bufferView"]]
+        assert view["byteOffset"] % 4 == 0 and accessor["componentType"] == 5126
+        values = np.frombuffer(binary, "<f4", wanted.numel(), view["byteOffset"])
+        np.testing.assert_allclose(values, wanted.flatten(), atol=1e-6)
+
+
+def test_a_glb_of_a_scene_answers_as_the_scene_does(tmp_path):
+    scene = painted_scene(**decoded("gathered"))
+    for name in ("a.scene", "a.glb"):
+        write_scene(tmp_path / name, scene)
+    ours, other = (read_scene(tmp_path / name, encode_texts=encode_texts) for name in ("a.scene", "a.glb"))
+    np.testing.assert_array_equal(ours.relevancy("dome"), other.relevancy("dome"))
+    assert len(read_splats(tmp_path / "a.glb")) == len(scene.splats)
+    with pytest.raises(UserError, match=r"--scene-file NAME.scene"):
+        keep_words(tmp_path / "a.glb", {})
+    write_splats(tmp_path / "b.glb", scene.splats)
+    with pytest.raises(UserError, match="without words"):
+        read_scene(tmp_path / "b.glb")
+
+
+def test_a_sog_is_read_back(tmp_path):
+    splats = some_splats(500, bands=1)
+    write_splats(tmp_path / "a.sog", splats)
+    found = read_splats(tmp_path / "a.sog")
+    torch.testing.assert_close(found.means, splats.means, atol=2e-3, rtol=1e-3)
+    torch.testing.assert_close(found.scales.log(), splats.scales.log(), atol=0.03, rtol=0)
+    torch.testing.assert_close(found.opacities, splats.opacities, atol=2 / 255, rtol=0)
+    torch.testing.assert_close(found.harmonics, splats.harmonics, atol=0.01, rtol=0)
+    assert float((found.quats * splats.quats).sum(1).abs().min()) > 0.9995 and found.antialiased
+
+
+def test_a_sog_has_the_pictures_that_its_meta_names(tmp_path):
+    splats = some_splats(10, bands=1)
+    write_splats(tmp_path / "a.sog", splats)
+    with zipfile.ZipFile(tmp_path / "a.sog") as bundle:
+        meta = json.loads(bundle.read("meta.json"))
+        pixels = {
+            name: np.asarray(Image.open(io.BytesIO(bundle.read(name))).convert("RGBA")).reshape(-1, 4)
+            for part in ("means", "scales", "quats", "sh0")
+            for name in meta[part]["files"]
+        }
+    assert meta["version"] == 2 and meta["count"] == 10 and meta["antialias"] is True
+    low, high = meta["means"]["mins"], meta["means"]["maxs"]
+    for i in range(10):
+        for axis in range(3):
+            steps = int(pixels["means_u.webp"][i, axis]) * 256 + int(pixels["means_l.webp"][i, axis])
+            log = low[axis] + steps / 65535 * (high[axis] - low[axis])
+            place = (1 if log >= 0 else -1) * (np.exp(abs(log)) - 1)
+            assert abs(place - float(splats.means[i, axis])) < 5e-3
+            book = meta["scales"]["codebook"][pixels["scales.webp"][i, axis]]
+            assert abs(book - float(splats.scales[i, axis].log())) < 0.1
+        largest = int(pixels["quats.webp"][i, 3]) - 252
+        assert largest == int(splats.quats[i].abs().argmax())
+
+
+def test_the_palette_of_a_sog_is_read(tmp_path):
+    splats = some_splats(6, bands=1)
+    write_splats(tmp_path / "a.sog", splats)
+    palette = np.random.default_rng(0).integers(0, 256, (64, 3, 3), np.uint8)
+    labels = np.zeros((16, 4), np.uint8) + 255
+    labels[:6, 0], labels[:6, 1] = [5, 0, 63, 7, 7, 1], 0
+    book = np.linspace(-1, 1, 256)
+
+    def webp(pixels) -> bytes:
+        written = io.BytesIO()
+        Image.fromarray(pixels).save(written, "WEBP", lossless=True, exact=True)
+        return written.getvalue()
+
+    with zipfile.ZipFile(tmp_path / "a.sog") as bundle:
+        files = {name: bundle.read(name) for name in bundle.namelist()}
+    meta = json.loads(files["meta.json"])
+    meta["shN"] = {"count": 64, "bands": 1, "codebook": book.tolist(), "files": ["c.webp", "l.webp"]}
+    files |= {"meta.json": json.dumps(meta), "l.webp": webp(labels.reshape(4, 4, 4))}
+    files["c.webp"] = webp(palette.reshape(1, 64 * 3, 3))
+    with zipfile.ZipFile(tmp_path / "b.sog", "w") as bundle:
+        for name, content in files.items():
+            bundle.writestr(name, content)
+    found = read_splats(tmp_path / "b.sog")
+    np.testing.assert_allclose(found.harmonics[2, 1:], book[palette[63]], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [("a.glb", b"glTF"), ("a.glb", b"glTF" + bytes(60)), ("a.sog", b"PK"), ("a.sog", b"")],
+)
+def test_what_is_no_glb_or_sog_is_refused(name, content, tmp_path):
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(UserError, match="damaged or incomplete"):
+        read_splats(tmp_path / name)
