@@ -52,6 +52,9 @@ from lang3dxl_ns.scene.symmetry import without_contradictions
 if TYPE_CHECKING:
     import pycolmap
 
+_DOUBTED = 0.1
+"""Share of doubtful photos above which a model is mapped anew without contradicting pairs. Honest models have
+fewer, and would lose a third of their photos."""
 _MEMORY_PER_THREAD = 1e9  # bytes that SIFT takes on a photo of 1600 pixels, the default `max_size`
 _FEW_FEATURES = 50
 _SMALLEST_MODEL = 3  # photos; COLMAP's default of ten may exceed the number of photos
@@ -83,17 +86,16 @@ def reconstruct(
             _extract(database, copies, settings)
         with part("matching"):
             _match(database, copies.names, settings)
-        with part("mapping"), TemporaryDirectory(dir=work) as folder:
-            consistent = Path(folder) / "database.db"
-            contradicting = without_contradictions(database, consistent)
-            models = _map(consistent, copies, work, settings.mapper)
+        with part("mapping"):
+            models, contradicting = _map(database, copies, work, settings.mapper), 0
+            if models and len(_doubts(database, models[0])) > _DOUBTED * models[0].num_reg_images():
+                models, contradicting = _map_consistent(database, models, copies, work, settings.mapper)
     features, partners = _features_and_partners(database)
     if not models:
         raise UserError(_why_no_model(features, partners))
     best, names = models[0], dict(zip(copies.names, good.names, strict=True))
     reasons = _reasons(copies.names, models, features, partners)
-    with load_pycolmap().Database.open(database) as db:
-        doubts = doubtful_placements(rotations_of(best), matched_pairs(db, cameras_of(best)))
+    doubts = _doubts(database, best)
     doubtful = {names[best.images[i].name]: why for i, why in sorted(doubts.items())}
     for image in (image for model in models for image in model.images.values()):
         image.name = names[image.name]
@@ -302,6 +304,28 @@ def _map(database: Path, photos: PhotoFolder, work: Path, kind: str) -> list[pyc
         if models:
             break
     return sorted(models, key=lambda model: -model.num_reg_images())
+
+
+def _doubts(database: Path, model: pycolmap.Reconstruction) -> dict[int, str]:
+    """Find a model's doubtful photos by number, with reasons."""
+    with load_pycolmap().Database.open(database) as db:
+        return doubtful_placements(rotations_of(model), matched_pairs(db, cameras_of(model)))
+
+
+def _map_consistent(
+    database: Path, models: list[pycolmap.Reconstruction], photos: PhotoFolder, work: Path, kind: str
+) -> tuple[list[pycolmap.Reconstruction], int]:
+    """Map anew without the pairs that contradict others, and return the models and the number of pairs left
+    out; the models as they are if that makes none."""
+    say(
+        "many photos contradict their places, as on a building that looks alike from several "
+        "sides: mapping anew"
+    )
+    with TemporaryDirectory(dir=work) as folder:
+        consistent = Path(folder) / "database.db"
+        contradicting = without_contradictions(database, consistent, cameras_of(models[0]))
+        found = _map(consistent, photos, work, kind)
+    return (found, contradicting) if found else (models, 0)
 
 
 def _publish(models: list[pycolmap.Reconstruction], model: Path) -> None:

@@ -3,16 +3,19 @@
 A single pair doesn't tell: two towers match as two views of one tower do. But its rotation contradicts those
 of other pairs, around the building and through photos that see both sides. The photos are joined into groups,
 along the best supported rotations first; a pair that contradicts its group is left out of the mapping.
+Groups between which too many pairs disagree stay apart. Honest pairs are lost on the way, so this is meant
+for models that many photos contradict.
 """
 
 from __future__ import annotations
 
 import sqlite3
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
@@ -21,6 +24,9 @@ from scipy.spatial.transform import Rotation
 
 from lang3dxl_ns.scene.colmap import load_pycolmap
 from lang3dxl_ns.scene.placements import MatchedPair, matched_pairs
+
+if TYPE_CHECKING:
+    import pycolmap
 
 APART = 40.0
 """Degrees between a pair's rotation and its group's from which the pair contradicts the group. Focal lengths
@@ -52,13 +58,18 @@ class _Groups:
             self.rotation[photo] = self.rotation[photo] @ turn.T
 
 
-def without_contradictions(database: Path, copy: Path) -> int:
-    """Copy COLMAP's database without the pairs whose rotations contradict others, and return their number."""
+def without_contradictions(database: Path, copy: Path, known: Mapping[int, pycolmap.Camera]) -> int:
+    """Copy COLMAP's database without the pairs whose rotations contradict others, and return their number.
+
+    Args:
+        database: with verified pairs. copy: file to write. known: cameras of an earlier model, by the photos'
+            numbers, whose focal lengths are better than the database's guesses.
+    """
     with closing(sqlite3.connect(database)) as source, closing(sqlite3.connect(copy)) as target:
         source.backup(target)
     with load_pycolmap().Database.open(copy) as db:
         cameras = {image.image_id: db.read_camera(image.camera_id) for image in db.read_all_images()}
-        contradicting = contradicting_pairs(matched_pairs(db, cameras))
+        contradicting = contradicting_pairs(matched_pairs(db, cameras | dict(known)))
         for first, second in contradicting:
             db.delete_two_view_geometry(first, second)
     return len(contradicting)

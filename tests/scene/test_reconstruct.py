@@ -85,6 +85,16 @@ def test_what_matches_measure_agrees_with_the_model(reconstructed):
     }
 
 
+def test_a_model_that_many_photos_contradict_is_mapped_anew(photos, monkeypatch, capsys):
+    """Nothing really contradicts here, so all photos keep a pose."""
+    doubts = iter([{1: "it looks away"}, {}])
+    monkeypatch.setattr(module, "_doubts", lambda database, model: next(doubts))
+    report = reconstruct(find_photos(photos), photos / "work", photos / "sparse")
+    assert "mapping anew" in capsys.readouterr().out
+    assert report.registered == 7
+    assert not list((photos / "work").glob("tmp*"))
+
+
 def test_all_photos_share_the_camera(reconstructed):
     _, model, _ = reconstructed
     assert pycolmap.Reconstruction(model).num_cameras() == 1
