@@ -18,9 +18,9 @@ from lang3dxl_ns.things.join import VIEWS, Joined, join, without_crumbs
 from lang3dxl_ns.things.pieces import LEVELS, Piece, Shown, pieces_of
 from lang3dxl_ns.things.thing import Sighting, Thing, upright_box
 
-_COLORED = 20
+COLORED = 20
 """Number of Gaussians within and around the matches below which colors tell nothing."""
-_SAME = 0.5
+SAME = 0.5
 """Overlap (intersection over union of weights) from which two words' things are one."""
 
 
@@ -95,11 +95,11 @@ def _sharpened(scene: Scene, relevancy: Float[Tensor, " n"]) -> Float[Tensor, " 
     means, colors = scene.splats.means.cpu().numpy(), scene.splats.harmonics[:, 0].cpu().numpy()
     values, mass = relevancy.cpu().numpy(), scene.mass.cpu().numpy()
     match = np.flatnonzero((values > 0.9) & (mass > 0))
-    if len(match) < _COLORED:
+    if len(match) < COLORED:
         return relevancy
     near = np.isfinite(KDTree(means[match]).query(means, distance_upper_bound=scene.gap)[0])
     around = np.flatnonzero((values < 0.5) & near & (mass > 0))
-    if len(around) < _COLORED:
+    if len(around) < COLORED:
         return relevancy
     rows = np.concatenate([match, around])
     weight = np.sqrt(mass[rows]) * len(rows) / 2
@@ -152,6 +152,6 @@ def _known(thing: Thing, known: Sequence[Thing], mass: Float[Array, " n"]) -> Th
     """Give a thing the id of one that another word found at the same place."""
     for other in known:
         shared = mass[np.intersect1d(thing.rows, other.rows)].sum()
-        if shared > _SAME * mass[np.union1d(thing.rows, other.rows)].sum():
+        if shared > SAME * mass[np.union1d(thing.rows, other.rows)].sum():
             return replace(thing, id=other.id)
     return thing

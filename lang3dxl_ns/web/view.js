@@ -57,7 +57,7 @@ export class View extends EventTarget {
 
   /** Show heat: layers of { relevancy, threshold, peak, color }, the strongest where several match. */
   recolor(layers = []) {
-    const told = [this.limit, ...layers.flatMap(({ relevancy, threshold, color }) => [relevancy, threshold, color])];
+    const told = [this.limit, this.only, ...layers.flatMap(({ relevancy, threshold, color }) => [relevancy, threshold, color])];
     if (!this.splats || (told.length === this.layers?.length && told.every((value, k) => value === this.layers[k]))) return;
     Object.assign(this, { layers: told, shown: layers });
     for (let i = 0; i < this.plain.length / 4; i++) {
@@ -68,7 +68,7 @@ export class View extends EventTarget {
       const warmth = chosen && (best - chosen.threshold) / Math.max(chosen.peak - chosen.threshold, 1e-6);
       const share = chosen ? HEAT * (0.5 + 0.5 * Math.min(warmth, 1)) : 0;
       for (let k = 0; k < 3; k++) this.bytes[16 * i + k] = this.plain[4 * i + k] * (1 - share) + (chosen?.color[k] ?? 0) * share;
-      this.bytes[16 * i + 3] = this.floats?.[i] > this.limit ? 0 : this.plain[4 * i + 3];
+      this.bytes[16 * i + 3] = this.floats?.[i] > this.limit || (this.only && !this.only.has(i)) ? 0 : this.plain[4 * i + 3];
     }
     this.upload();
   }

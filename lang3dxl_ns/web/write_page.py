@@ -32,6 +32,7 @@ from lang3dxl_ns.query.thresholds import EVEN, SHARE
 from lang3dxl_ns.query.trust import ALIKE, ANCHORS, CLEARLY, FAINT, FAR, STRICTER, STRICTEST
 from lang3dxl_ns.query.visibility import spread
 from lang3dxl_ns.query.vocabulary import common_words, same_thing, shipped_vocabulary
+from lang3dxl_ns.things import find, grammar, join, pieces, thing
 from lang3dxl_ns.web.pack import (
     LEAST_PIXELS,
     PIXEL_STEPS,
@@ -60,6 +61,14 @@ _RULES = {
 }
 """Numbers that decide what matches, what is doubtful and what a place is called, for the page's answers."""
 _RANKING = ("PEAK", "LARGE", "RIM", "STRONG", "CORE", "JOINED", "OUTLIERS", "DENSE")
+_THINGS = (
+    (pieces, "LEVELS PART DEPTH"),
+    (join, "SHARED SPLINTER VIEWS CRUMB MOST_SHARED"),
+    (thing, "OUTLIERS TURNS"),
+    (find, "COLORED SAME"),
+    (grammar, "BESIDE INSIDE"),
+)
+"""Numbers that tell things apart and relate them, by the modules that hold them."""
 _TEXTS = 256
 """Number of texts encoded at a time."""
 _DATA = re.compile(
@@ -281,6 +290,8 @@ def language_module() -> bytes:
     """Write the table of what people type, and the numbers by which views are ranked, as a module."""
     table = {name: value for name, value in TABLE.items() if name != "cases"}
     table["ranking"] = {name: getattr(view_ranking, name) for name in _RANKING}
+    table["grammar"] = grammar.table()
+    table["things"] = {name: getattr(module, name) for module, names in _THINGS for name in names.split()}
     return f"export default {json.dumps(table, ensure_ascii=False)};\n".encode()
 
 
