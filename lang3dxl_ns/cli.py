@@ -38,6 +38,7 @@ BENCHMARKS = {
     "pt-ovs": ("lab.benchmarks.published:PtOvs", "PT-OVS, scene by scene."),
     "teaching": ("lab.benchmarks.teaching:TeachingBenchmark", "Words taught by example, beside the text."),
     "trust": ("lab.benchmarks.trust:TrustBenchmark", "Cautions under wrong answers, and under right ones."),
+    "page": ("lab.benchmarks.page_speed:PageBenchmark", "Seconds until the page of a scene answers."),
     "things": ("lab.benchmarks.things:ThingsBenchmark", "Single windows and towers: F1, counts, boxes."),
     "attach": ("lab.benchmarks.attach:AttachBenchmark", "Words attached to a splat, beside its run's."),
 }
@@ -86,10 +87,7 @@ def main(arguments: list[str] | None = None) -> None:
             if sys.stdout is not None:  # closed at the start
                 sys.stdout.flush()
     except UserError as error:
-        # Messages name the options of ns-train, which these two pass on; others have them without the prefix.
-        prefix = "--" if words[0] in ("demo", "benchmark") else "--pipeline.datamanager."
-        message = str(error).replace(prefix, "--")
-        sys.exit(f"Error: {message.replace('--pipeline.model.', '--') if words[0] == 'train' else message}")
+        sys.exit(f"Error: {error}")
     except ModuleNotFoundError as error:
         if not misses_nerfstudio(error):
             raise
@@ -113,21 +111,42 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 _TEXTS = "Texts follow --text: lang3dxl {} RUN --text windows{}"
+_MORE = "Settings that few need are listed too with --help-all."
 
 
 def _parsed(words: Sequence[str]) -> Any:
     """Parse the words into the called command with its settings. Exits with a hint if they are not valid."""
     _check_name(COMMANDS, words)
+    words = with_all_texts(words)
     try:
-        choice = _choice(COMMANDS, words)
-        parsed = tyro.cli(choice, args=words, description=__doc__, config=(tyro.conf.OmitArgPrefixes,))
+        config = (tyro.conf.OmitArgPrefixes,)
+        parsed = tyro.cli(
+            _choice(COMMANDS, words), prog="lang3dxl", args=words, description=__doc__, config=config
+        )
     except SystemExit as error:
+        if not error.code and len(words) > 1 and "--help-all" not in sys.argv:
+            print(_MORE)
         if error.code == 2 and words[0] in ("query", "export"):
             print(_TEXTS.format(words[0], "" if words[0] == "query" else " --out found.ply"), file=sys.stderr)
         raise
     # Shells leave the ~ of --out=~/found as it is.
     vars(parsed).update({name: expanded(v) for name, v in vars(parsed).items() if isinstance(v, Path)})
     return parsed
+
+
+def with_all_texts(words: Sequence[str]) -> list[str]:
+    """Repeat --text before each further text, as people write `--text windows doors`. What names a file or
+    folder is the scene and stays as it is."""
+    given, value, texts = [], False, False
+    for word in words:
+        if word.startswith("-"):
+            value = texts = word == "--text"
+        elif value:
+            value = False
+        elif texts and not Path(word).exists():
+            given.append("--text")
+        given.append(word)
+    return given
 
 
 def _check_name(commands: Mapping[str, Any], words: Sequence[str], above: str = "lang3dxl") -> None:

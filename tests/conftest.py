@@ -108,8 +108,6 @@ def pytest_runtest_teardown() -> None:
                 one.tb_writer.close()
         writer.EVENT_WRITERS.clear()
         writer.EVENT_STORAGE.clear()
-    if models := sys.modules.get("lang3dxl_ns.preparation.model_files"):
-        models.option_prefix.set(models._PREFIX)  # a command that ran in this process spells options its way
 
 
 @pytest.fixture(scope="session")
@@ -139,6 +137,21 @@ def two_steps(tmp_path_factory, tiny_clip, tiny_dense):
     trainer.setup()
     trainer.train()
     return trainer
+
+
+def fitted(data: Path, clip: Path, dense: Path, out: Path, steps: int = 2):
+    """A finished `fit.Run`, without nerfstudio, with a small sky and few steps of learning codes."""
+    from lang3dxl_ns.common.stages import Stages
+    from lang3dxl_ns.scene.capture import open_capture
+    from lang3dxl_ns.training.fit import Settings, begin
+
+    settings = Settings.of("lang3dxl", steps)
+    settings.targets.clip, settings.targets.dense = str(clip), str(dense)
+    settings.scene.sky_gaussians, settings.scene.semantic_field.code_dim = 50, 3
+    settings.scene.decoder.compression.steps = 20
+    run = begin(open_capture(data), settings, out, data / "lang3dxl_cache", "cpu")
+    run.complete(Stages({"train": 1.0, "words": 1.0}))
+    return run
 
 
 @pytest.fixture

@@ -11,12 +11,11 @@ import torch
 from painted_scene import painted_scene
 from PIL import Image
 
-from lang3dxl_ns.attachment.attach import attach
 from lang3dxl_ns.cli import main
 from lang3dxl_ns.common.device import known_device
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.options import data_option, model_option
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth
-from lang3dxl_ns.preparation.model_files import option_prefix, short_options, spoken
 from lang3dxl_ns.query.match import together
 from lang3dxl_ns.query.text import Prompt, parse_prompts
 
@@ -205,10 +204,15 @@ def test_a_device_that_is_not_there_is_told(device, tmp_path):
     assert known_device("cpu") == torch.device("cpu")
 
 
-def test_calling_attach_leaves_the_options_of_later_messages(tmp_path):
-    before = option_prefix.get()
-    with pytest.raises(UserError):
-        attach(tmp_path / "none.ply", out=tmp_path / "a.scene")
-    with short_options():
-        assert spoken("--pipeline.datamanager.clip") == "--clip"
-    assert option_prefix.get() == before
+@pytest.mark.parametrize(
+    ("command", "clip", "gaussians"),
+    [
+        ("/usr/bin/ns-train", "--pipeline.datamanager.clip", "--pipeline.model.max-gaussians"),
+        ("/x/nerfstudio/scripts/train.py", "--pipeline.datamanager.clip", "--pipeline.model.max-gaussians"),
+        ("/usr/bin/lang3dxl", "--clip", "--max-gaussians"),
+        ("", "--clip", "--max-gaussians"),
+    ],
+)
+def test_messages_spell_options_as_the_command_that_runs_has_them(command, clip, gaussians, monkeypatch):
+    monkeypatch.setattr("sys.argv", [command])
+    assert data_option("clip") == clip and model_option("max-gaussians") == gaussians

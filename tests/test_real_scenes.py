@@ -5,8 +5,10 @@ import shutil
 
 import pytest
 
+from lang3dxl_ns.evaluation.score_run import score_features
 from lang3dxl_ns.preparation.physical_scale import pixel_sizes, propose_scale_range
 from lang3dxl_ns.scene.colmap import read_reconstruction
+from lang3dxl_ns.training.snapshot import snapshot
 
 
 @pytest.fixture(params=[pytest.param("sceaux", marks=pytest.mark.nightly), "sceaux_wild"])
@@ -36,8 +38,10 @@ def test_a_short_run_shows_the_facade_and_beats_the_mean_feature(train, real_sce
         # with random weights follow them: what was learned must serve the photos it was learned from.
         assert metrics["half_psnr"] > 17.0
         datamanager, model = trainer.pipeline.datamanager, trainer.pipeline.model.eval()
-        camera, batch = next(datamanager.train_photos())
-        learned = model.feature_metrics(camera, batch)
+        view, batch = next(datamanager.data.every_photo())
+        run, side = model.run, model.config.decode_size[1]
+        scene = snapshot(run, datamanager.data.record())
+        learned = score_features(scene, run.parts.semantics, view.camera(), batch, side)
         assert learned["clip_l1"] < 0.7 * learned["clip_l1_of_mean"]
 
 

@@ -5,12 +5,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import fitted
 from painted_scene import DISTANCE, DOME, painted_gaussians, painted_scene
 from PIL import Image
 
 import lang3dxl_ns.open_scene as opening
-
-pytestmark = pytest.mark.nerfstudio
 
 PAGE = (Path(__file__).parents[1] / "docs" / "python.md").read_text()
 RECIPES = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
@@ -29,8 +28,8 @@ def after(tmp_path_factory):
         yield states
 
 
-def test_all_recipes_run_on_a_run_trained_by_the_suite(two_steps, tmp_path, monkeypatch):
-    scene = opening.load_scene(two_steps.base_dir)
+def test_all_recipes_run_on_a_run_trained_by_the_suite(scene, tiny_clip, tiny_dense, tmp_path, monkeypatch):
+    scene = fitted(scene, tiny_clip, tiny_dense, tmp_path / "run").scene()
     monkeypatch.setattr(opening, "load_scene", lambda path=None: scene)
     monkeypatch.chdir(tmp_path)
     names: dict = {}

@@ -33,12 +33,12 @@ from lang3dxl_ns.common.reports import host_peak
 if TYPE_CHECKING:
     from lang3dxl_ns.evaluation.ground_truth import GroundTruth
     from lang3dxl_ns.evaluation.scores import LanguageScorer, Maps, MapScorer
-    from lang3dxl_ns.plugin.datamanager import Lang3DXLDataManager
     from lang3dxl_ns.plugin.pipeline import Lang3DXLPipeline
     from lang3dxl_ns.plugin.trainer_config import Lang3DXLTrainerConfig
     from lang3dxl_ns.preparation.segmentation import TextSegmenter
     from lang3dxl_ns.preparation.targets import TargetReader
     from lang3dxl_ns.scene.photo import Photo
+    from lang3dxl_ns.training.batches import TrainingData
 
 _LIBRARIES = ("lang3dxl_ns.plugin.trainer_config", "lang3dxl_ns.methods")
 """Modules that a run's process imports. They are preloaded because the imports take ten seconds."""
@@ -269,11 +269,11 @@ def _beside(pipeline: Lang3DXLPipeline) -> dict[str, float]:
     from lab.landmark.novel_views_of_runs import evaluate_novel_views
     from lang3dxl_ns.evaluation.aggregate import PREFIXES, average
 
-    scorer, photos = pipeline.evaluation.scorer, pipeline.datamanager.train_dataset.photos
-    splits = {}
-    if read_novel_views(pipeline.datamanager.data_folder) is not None:
-        splits["test"] = evaluate_novel_views(pipeline)
-    if scorer is not None and any(scorer.truth.key(photo.name) is not None for photo in photos):
+    scorer, data = pipeline.evaluation.scorer, pipeline.datamanager.data
+    names, splits = data.capture.split.train, {}
+    if read_novel_views(data.capture.folder) is not None:
+        splits["test"] = evaluate_novel_views(pipeline.model.run, data)
+    if scorer is not None and any(scorer.truth.key(name) is not None for name in names):
         splits["seen"] = pipeline.evaluation.evaluate("seen")
     found = {}
     for split, evaluated in splits.items():
@@ -298,16 +298,19 @@ def _peak() -> float:
 @torch.no_grad()
 def _time_answers(pipeline: Lang3DXLPipeline) -> dict[str, float]:
     """Measure the median milliseconds to render a held-out view, and to answer all prompts in it."""
+    from lang3dxl_ns.plugin.cameras import to_rasterizer
+
     scorer = pipeline.evaluation.scorer
     if scorer is None:
         return {}
     pipeline.eval()
     times: dict[str, list[float]] = {"render_ms": [], "answer_ms": []}
+    scene = pipeline.model.scene(pipeline.scene_file, encode_texts=scorer.encode_texts)
     for camera, _ in islice(pipeline.datamanager.fixed_indices_eval_dataloader, _TIMED_PHOTOS):
         start = _now()
         pipeline.model.get_outputs_for_camera(camera)
         rendered = _now()
-        pipeline.evaluation.relevancy(camera, scorer.queries.to(pipeline.device), scorer.yardstick)
+        scene.relevancy_maps(to_rasterizer(camera), scorer.queries.to(pipeline.device))
         times["render_ms"].append(1000 * (rendered - start))
         times["answer_ms"].append(1000 * (_now() - rendered))
     return {name: median(values) for name, values in times.items()}
@@ -381,9 +384,9 @@ def _score_fine_crops(run: Run, settings: RunSettings, work: Path) -> dict[str, 
     data, config = _colors_alone(deepcopy(whole)), whole.pipeline.datamanager
     config.dense = "none"
     found: dict[str, float] = {}
-    plan, store = data.crop_plan, FeatureStore(work / "targets")
+    plan, store = data.crops, FeatureStore(work / "targets")
     for prefix, truth, photos in _pictures(run, data):
-        views = read_novel_views(data.data_folder) if prefix else None
+        views = read_novel_views(data.capture.folder) if prefix else None
         sizes = plan.pixel_sizes if views is None else novel_pixel_sizes(data, views, photos)
         names = [photo.name for photo in photos]
         targets = prepare(photos, sizes, config, plan.scales, store, "cpu", fine=names)
@@ -397,21 +400,21 @@ def _crop_maps(scorer: LanguageScorer, targets: TargetReader, photo: Photo, size
     return scorer.teacher_maps(targets.clip(photo.name).features.float(), size)
 
 
-def _colors_alone(config: Lang3DXLTrainerConfig) -> Lang3DXLDataManager:
-    """Set up the data manager of a configuration without encoders, so that it makes no targets."""
+def _colors_alone(config: Lang3DXLTrainerConfig) -> TrainingData:
+    """Open the data of a configuration without encoders, so that it makes no targets."""
     data = config.pipeline.datamanager
     data.clip = data.dense = "none"
-    return data.setup(device="cpu", test_mode="test")
+    return data.setup(device="cpu", test_mode="test").data
 
 
-def _pictures(run: Run, data: Lang3DXLDataManager) -> Iterator[tuple[str, GroundTruth, list[Photo]]]:
+def _pictures(run: Run, data: TrainingData) -> Iterator[tuple[str, GroundTruth, list[Photo]]]:
     """Yield held-out photos and test views, each with the prefix of their figures and their truth."""
-    from lab.landmark.novel_views_of_runs import novel_dataset
+    from lab.landmark.novel_views_of_runs import novel_data
     from lang3dxl_ns.evaluation.ground_truth import GroundTruth
 
-    yield "", GroundTruth(run.scene / "ground_truth"), data.eval_dataset.photos
-    if (views := read_novel_views(data.data_folder)) is not None:
-        yield "test_", views.truth, novel_dataset(data, views).photos
+    yield "", GroundTruth(run.scene / "ground_truth"), [data.photos[n] for n in data.capture.split.held_out]
+    if (views := read_novel_views(data.capture.folder)) is not None:
+        yield "test_", views.truth, novel_data(data, views).as_read
 
 
 def _score_pictures(

@@ -9,10 +9,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+import tyro
 from rich import get_console
 from rich.markdown import Markdown
 
-from lab.reports import command_line, with_flags
+from lab.reports import command_line
 from lab.stages import MeasuredStages
 from lang3dxl_ns.common.checks import check_numbers
 from lang3dxl_ns.common.console import say
@@ -24,13 +25,10 @@ from lang3dxl_ns.common.settings_help import showing
 if TYPE_CHECKING:
     from lab.landmark.picture import PictureRow
     from lang3dxl_ns.evaluation.photo_metrics import EvaluatedPhoto
-    from lang3dxl_ns.plugin.pipeline import Lang3DXLPipeline
-    from lang3dxl_ns.plugin.trainer import Lang3DXLTrainer
-    from lang3dxl_ns.plugin.trainer_config import Lang3DXLTrainerConfig
+    from lang3dxl_ns.evaluation.score_run import Evaluation
     from lang3dxl_ns.query.match import Match
-
-RUN = Path("run", "lang3dxl", "demo")
-"""Folder of the run inside the demo's folder."""
+    from lang3dxl_ns.query.scene import Scene
+    from lang3dxl_ns.training.fit import Settings
 
 
 @showing("out", "quick", "seed")
@@ -66,8 +64,10 @@ class Demo:
     """CLIP to use: "builtin", a Hugging Face name, a folder, or "none" for colors only."""
     dense: str = "auto"
     """Dense encoder to use, with the same choices, or "auto", which takes the one that the CLIP needs."""
-    ns_train: str = ""
-    """Extra flags of `ns-train lang3dxl` in one string: --ns-train="--pipeline.model.sky-gaussians 0"."""
+    train: str = ""
+    """Extra flags of `lang3dxl train` in one string: --train="--sky-gaussians 0"."""
+    restart: bool = False
+    """Train anew, over the run in the folder."""
 
     def main(self) -> None:
         check_numbers(self, _BOUNDS)
@@ -78,6 +78,14 @@ class Demo:
             sys.exit(f"\nStopped. Finished work is kept in {out}; the same command continues.")
 
     def _run(self, out: Path) -> None:
+        from lang3dxl_ns.evaluation.score_run import Evaluation, EvaluationSettings
+        from lang3dxl_ns.preparation.model_files import check_encoders
+        from lang3dxl_ns.scene.capture import open_capture
+        from lang3dxl_ns.training.checkpoint import CHECKPOINT
+        from lang3dxl_ns.training.fit import begin
+
+        settings = self.settings(out)
+        check_encoders(settings.targets.clip, settings.targets.dense)
         scene, stages = out / "scene", MeasuredStages(_SHARES, out / "stages.json")
         if kept := (scene / "scene.json").exists():
             say("scene: kept from an earlier command")
@@ -85,44 +93,40 @@ class Demo:
             if not kept:
                 from lab.landmark.scene_writer import DemoScene, write_scene
 
-                settings = {"family": self.family, **self._wanted}
-                write_scene(DemoScene(out=scene, **settings))
-        config = self._config(scene, out)
-        trainer: Lang3DXLTrainer = config.setup(local_rank=0, world_size=1)
-        trainer.stages = stages
-        trainer.setup()
-        if not trainer.is_finished:
-            trainer.train()
-        else:
-            say("train: skipped, the run is finished")
+                write_scene(DemoScene(out=scene, **{"family": self.family, **self._wanted}))
+        if self.restart:
+            (out / CHECKPOINT).unlink(missing_ok=True)
+        with stages.stage("prepare"):
+            run = begin(open_capture(scene), settings, out, scene / "lang3dxl_cache")
+        trained = run.complete(stages)
         with stages.stage("evaluate"):
-            photos = list(trainer.pipeline.evaluation.evaluate("held-out"))
+            evaluation = Evaluation(run.state, run.data, EvaluationSettings())
+            photos = list(evaluation.evaluate("held-out"))
             splits = {"Held-out photos": photos}
             if (scene / "test_views").is_dir():
                 from lab.landmark.novel_views_of_runs import evaluate_novel_views
 
-                splits = {"Test views": list(evaluate_novel_views(trainer.pipeline)), **splits}
-            report = self._report(splits, trainer)
+                splits = {"Test views": list(evaluate_novel_views(run.state, run.data)), **splits}
+            report = self._report(splits, trained)
         report |= stages.figures()
-        folder = config.get_base_dir()
-        write_report(folder, "report", self.markdown(report), report)
-        matches = _scored_matches(trainer.pipeline, [photo.name for photo in photos])
-        drawn = (_picture_row(photo, trainer, matches[photo.name]) for photo in photos)
+        write_report(out, "report", self.markdown(report), report)
+        matches = _scored_matches(trained, evaluation, [photo.name for photo in photos])
+        drawn = (_picture_row(photo, evaluation, matches[photo.name]) for photo in photos)
         if rows := [row for row in drawn if row.truth]:
             from lab.landmark.picture import draw_picture, most_telling
 
-            draw_picture(most_telling(rows, 3), folder / "report.png")
+            draw_picture(most_telling(rows, 3), out / "report.png")
         get_console().print(Markdown(self.markdown(report)))
         from lab.landmark.picture import CAPTION
 
-        say(f"\nReport: {folder / 'report.md'}. Picture: {folder / 'report.png'} ({CAPTION})")
-        run = shlex.quote(os.path.relpath(out))
+        say(f"\nReport: {out / 'report.md'}. Picture: {out / 'report.png'} ({CAPTION})")
+        place = shlex.quote(os.path.relpath(out))
         say(
             "Next:",
-            f"  walk through it  lang3dxl view {run}",
-            f'  ask it           lang3dxl query {run} --text "windows" --out found',
-            f"  share it         lang3dxl export {run} --web page",
-            "  your own photos  ns-train lang3dxl --data FOLDER",
+            f"  walk through it  lang3dxl view {place}",
+            f'  ask it           lang3dxl query {place} --text "windows" --out found',
+            f"  share it         lang3dxl export {place} --web page",
+            "  your own photos  lang3dxl train FOLDER",
         )
 
     def _folder(self) -> Path:
@@ -162,36 +166,35 @@ class Demo:
         }
         return wanted | ({} if self.family == "auto" else {"family": self.family})
 
-    def _config(self, scene: Path, out: Path) -> Lang3DXLTrainerConfig:
-        """Build the run's configuration, resuming from an earlier command's checkpoint if there is one."""
-        from lang3dxl_ns.methods import run_config
+    def settings(self, out: Path) -> Settings:
+        """Return the settings of the training."""
+        from lang3dxl_ns.commands.train import Train
+        from lang3dxl_ns.preparation.settings import PreparationConfig
 
         steps = self.steps or (250 if self.quick else 1_200)
-        config = run_config(scene, out, str(RUN.parts[0]), steps, self.clip, self.dense)
-        config.timestamp = RUN.name
-        config.pipeline.datamanager.foreground = "none"  # score every pixel, also of sky and people
-        config.pipeline.datamanager.camera_res_scale_factor = 0.5  # words are scored at half the size
+        usual = Train(
+            data=out / "scene",
+            out=out,
+            steps=steps,
+            clip=self.clip,
+            dense=self.dense,
+            photo_scale=0.5,  # words are scored at half the size
+            foreground="none",  # score every pixel, also of sky and people
+            dense_tokens=32 if self.quick else PreparationConfig.dense_tokens,
+        )
+        settings = tyro.cli(Train, args=shlex.split(self.train), default=usual).settings()
         if self.quick:
-            config.pipeline.datamanager.dense_tokens = 32
-            config.pipeline.model.decoder.compression.steps = 300
-        config.logging.steps_per_log = 50
-        if self.ns_train:
-            config = with_flags(config, self.ns_train)
-        checkpoints = config.get_checkpoint_dir()
-        if any(checkpoints.glob("*.ckpt")):
-            config.load_dir = checkpoints
-        config.set_timestamp()
-        config.save_config()
-        get_console().log(f"Training {steps} iterations; the run is in {config.get_base_dir()}")
-        return config
+            settings.scene.decoder.compression.steps = 300
+        settings.resolve()
+        return settings
 
-    def _report(self, splits: dict[str, list[EvaluatedPhoto]], trainer: Lang3DXLTrainer) -> dict[str, Any]:
+    def _report(self, splits: dict[str, list[EvaluatedPhoto]], scene: Scene) -> dict[str, Any]:
         from lang3dxl_ns.evaluation.aggregate import average
 
         return {
             "command": command_line("lang3dxl demo", self),
-            "machine": describe_machine(trainer.device),
-            "gaussians": trainer.pipeline.model.num_points,
+            "machine": describe_machine(scene.device),
+            "gaussians": len(scene.splats),
             "splits": {
                 name: average([photo.metrics for photo in photos]) | {"protocol": {"photos": len(photos)}}
                 for name, photos in splits.items()
@@ -231,24 +234,24 @@ _SHARES = {"scene": 0.12, "prepare": 0.24, "train": 0.28, "words": 0.08, "evalua
 """Stages of the demo, with their usual shares of its time on a CPU."""
 
 
-def _scored_matches(pipeline: Lang3DXLPipeline, photos: list[str]) -> dict[str, dict[str, Match]]:
+def _scored_matches(scene: Scene, evaluation: Evaluation, photos: list[str]) -> dict[str, dict[str, Match]]:
     """Find every scored prompt in the views of some photos as a user would, by photo and prompt. Without
     words or ground truth there are no matches."""
     from lang3dxl_ns.query.text import Prompt
 
-    scorer, model = pipeline.evaluation.scorer, pipeline.model
-    if scorer is None or model.carried is None:
+    scorer = evaluation.scorer
+    if scorer is None:
         return {photo: {} for photo in photos}
-    scene, prompts = model.scene(pipeline.scene_file), scorer.truth.categories
+    prompts, scene.encode_texts = scorer.truth.categories, scorer.encode_texts
     question = scene.ask([Prompt(text) for text in prompts])
     return {photo: dict(zip(prompts, scene.matches(question, photo), strict=True)) for photo in photos}
 
 
-def _picture_row(photo: EvaluatedPhoto, trainer: Lang3DXLTrainer, matches: dict[str, Match]) -> PictureRow:
+def _picture_row(photo: EvaluatedPhoto, evaluation: Evaluation, matches: dict[str, Match]) -> PictureRow:
     from lab.landmark.picture import PictureRow
 
     real, rendered = photo.images["img"].cpu().chunk(2, dim=1)
-    scorer, truth = trainer.pipeline.evaluation.scorer, {}
+    scorer, truth = evaluation.scorer, {}
     if scorer is not None:
         size = next(iter(photo.maps.values())).shape
         truth = scorer.truth.masks(photo.name, (size[0], size[1]))

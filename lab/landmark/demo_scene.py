@@ -29,6 +29,9 @@ class DemoScene:
     wild: bool = True
     """Vary sizes, lenses, weather, exposures and passers-by as in photos from the Internet. --no-wild uses
     one camera, one sun and no people."""
+    weathered: bool = False
+    """Give walls and windows stains and grain of their own, as real ones have, to try reconstruction. The
+    built-in encoders know landmarks without them."""
     width: int = 480
     """Width of a landscape photo, pixels. Wild photos are smaller."""
     height: int = 360

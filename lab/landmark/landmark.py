@@ -39,9 +39,11 @@ class Landmark:
     """Bounds (lower and upper corner) of everything but the ground, which keep cameras and people out."""
     things: tuple[tuple[str, range], ...] = ()
     """Part and range of shapes of every dome, tower, spire and minaret, see `ShapeList.things`."""
+    weathered: bool = False
+    """Whether walls and windows have stains and grain of their own, see `weathering`."""
 
     @classmethod
-    def from_seed(cls, seed: int, family: str | None = None) -> Landmark:
+    def from_seed(cls, seed: int, family: str | None = None, weathered: bool = False) -> Landmark:
         """Build the landmark of this seed, which also chooses the family if it is None or "auto".
 
         Raises UserError for an unknown family.
@@ -60,7 +62,7 @@ class Landmark:
         return cls(
             seed=seed, family=family, shapes=tuple(builder.shapes), materials=tuple(builder.materials),
             center=center, radius=radius, height=float(high[2]), obstacles=np.array(standing),
-            things=tuple(builder.things),
+            things=tuple(builder.things), weathered=weathered,
         )  # fmt: skip
 
     def is_free(self, point, margin: float) -> bool:

@@ -125,7 +125,7 @@ def fractal_noise(x, y, seed: int, octaves: int = 4) -> np.ndarray:
     return total / (2 - 2 ** (1 - octaves))
 
 
-def _fade(size: float, footprint) -> np.ndarray:
+def resolved(size: float, footprint) -> np.ndarray:
     """Return 1 if a detail of this size is resolved, falling to 0 if it is finer than one footprint."""
     return np.clip(size / (2 * footprint) - 0.5, 0, 1)
 
@@ -138,12 +138,12 @@ def _courses(
     x = s / width + 0.5 * np.mod(row, 2)
     column = np.floor(x)
     in_joint = ((x - column) * width < joint) | ((t / height - row) * height < joint)
-    joints = 1 - np.float32(0.3) * in_joint * _fade(2 * joint, footprint)
-    return (1 + contrast * (_cell(column, row, seed) - 0.5) * _fade(height, footprint)) * joints
+    joints = 1 - np.float32(0.3) * in_joint * resolved(2 * joint, footprint)
+    return (1 + contrast * (_cell(column, row, seed) - 0.5) * resolved(height, footprint)) * joints
 
 
 def _blocks(s, t, footprint, seed) -> np.ndarray:
-    grain = 1 + 0.16 * (_noise(s * 2.1, t * 2.1, seed) - 0.5) * _fade(0.5, footprint)
+    grain = 1 + 0.16 * (_noise(s * 2.1, t * 2.1, seed) - 0.5) * resolved(0.5, footprint)
     return _courses(s, t, footprint, seed, 1.0, 0.48, 0.04, 0.36) * grain
 
 
@@ -159,22 +159,22 @@ def _bricks(s, t, footprint, seed) -> np.ndarray:
 
 def _bands(s, t, footprint, seed) -> np.ndarray:
     course = np.where(np.mod(t / 0.9, 2) < 1, np.float32(1.15), np.float32(0.62))
-    resolved = _fade(0.9, footprint)
-    return (course * resolved + 0.88 * (1 - resolved)) * _courses(s, t, footprint, seed, 1.4, 0.9, 0.04, 0.15)
+    shown = resolved(0.9, footprint)
+    return (course * shown + 0.88 * (1 - shown)) * _courses(s, t, footprint, seed, 1.4, 0.9, 0.04, 0.15)
 
 
 def _seams(s, t, footprint, seed) -> np.ndarray:
-    seam = np.float32(0.4) * (np.mod(s, 1.1) < 0.13) * _fade(0.3, footprint)
+    seam = np.float32(0.4) * (np.mod(s, 1.1) < 0.13) * resolved(0.3, footprint)
     return 1 - seam + 0.25 * (_noise(s * 0.8, t * 0.3, seed) - 0.5)
 
 
 def _planks(s, t, footprint, seed) -> np.ndarray:
-    joint = np.float32(0.4) * (np.mod(s, 0.35) < 0.05) * _fade(0.1, footprint)
+    joint = np.float32(0.4) * (np.mod(s, 0.35) < 0.05) * resolved(0.1, footprint)
     return (1 - joint) * (1 + 0.3 * (_cell(np.floor(s / 0.35), np.zeros_like(s), seed) - 0.5))
 
 
 def _panes(s, t, footprint, seed) -> np.ndarray:
-    return 0.6 + 0.9 * _cell(np.floor(s / 0.4), np.floor(t / 0.4), seed) * _fade(0.4, footprint)
+    return 0.6 + 0.9 * _cell(np.floor(s / 0.4), np.floor(t / 0.4), seed) * resolved(0.4, footprint)
 
 
 _PATTERNS: dict[str, Callable[..., np.ndarray]] = {

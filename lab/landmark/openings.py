@@ -87,6 +87,7 @@ class Openings(Shape):
         return Surface(
             normal=self._normal(u, v, jamb), s=s, t=np.where(jamb, v, t), shade=shade,
             sunlit=self._sunlit(s, t, depth, sun) * ~jamb, trim=~filled, element=~band,
+            copy=self._number(point[1], point[2]),
         )  # fmt: skip
 
     def _tile(self, y, z):
@@ -95,6 +96,12 @@ class Openings(Shape):
         u = np.mod(y + self.field[0] / 2, w) - w / 2
         sill = 0.0 if self.rows == 1 else (h - self.height) / 2
         return u, np.mod(z, h) - sill
+
+    def _number(self, y, z):
+        """Number the openings of the field."""
+        column = np.floor((y / self.field[0] + 0.5) * self.columns).clip(0, self.columns - 1)
+        row = np.floor(z / self.field[1] * self.rows).clip(0, self.rows - 1)
+        return (row * self.columns + column).astype(np.int32)
 
     def _inside(self, u, v):
         """Compute the signed distance to the outline, meters, positive inside the opening."""

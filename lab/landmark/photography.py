@@ -13,7 +13,7 @@ from lab.landmark.labels import PART, building_mask
 from lab.landmark.landmark import Landmark
 from lab.landmark.materials import MATERIALS, Material
 from lab.landmark.raycast import Camera, cast
-from lab.landmark.shading import ShadowMap, Weather, light, trace
+from lab.landmark.shading import Grain, ShadowMap, Weather, light, trace
 from lab.landmark.shapes import MISS, Shape, floats
 from lab.landmark.surroundings import passers_by
 
@@ -92,11 +92,12 @@ def take_photo(landmark: Landmark, view: View, width: int, height: int, oversamp
     materials = landmark.materials + view.passers_by_materials
     reach = max(landmark.radius, landmark.height / 2) * 1.15
     shadows = ShadowMap.of(shapes, view.weather, landmark.center, reach)
-    truth = fine = trace(shapes, view.camera, view.weather, width, height)
+    truth = fine = trace(shapes, view.camera, view.weather, width, height, landmark.weathered)
     n = oversampling
     if n > 1:
-        fine = trace(shapes, view.camera, view.weather, width * n, height * n)
-    color = light(fine, materials, view.camera, view.weather, shadows)
+        fine = trace(shapes, view.camera, view.weather, width * n, height * n, landmark.weathered)
+    grain = Grain(max(width, height), landmark.seed) if landmark.weathered else None
+    color = light(fine, materials, view.camera, view.weather, shadows, grain)
     kinds = np.array([MATERIALS.index(material.name) for material in materials], dtype=np.uint8)
     return Shot(
         image=_develop(color.reshape(height, n, width, n, 3).mean(axis=(1, 3)), view.lens),

@@ -70,6 +70,7 @@ class _Order:
     size: tuple[int, int]
     points: int
     folder: Path
+    weathered: bool = False
     test_camera: Camera | None = None
     """Camera of a test view; None for photos, which choose their own."""
 
@@ -98,7 +99,7 @@ def write_scene(scene: DemoScene) -> Path:
     places: list[tuple[Path, int, Camera | None]] = [(unfinished, i + 1, None) for i in range(scene.photos)]
     places += [(unfinished / FOLDER, i + 1, camera) for i, camera in enumerate(cameras)]
     orders = [
-        _Order(number, scene.seed, landmark.family, scene.wild, size, points, folder, camera)
+        _Order(number, scene.seed, landmark.family, scene.wild, size, points, folder, scene.weathered, camera)
         for folder, number, camera in places
     ]
     taken = list(_taken(orders, scene.workers))
@@ -155,13 +156,13 @@ def _taken(orders: list[_Order], workers: int | None) -> Iterator[TakenPhoto]:
 
 
 @lru_cache(maxsize=1)
-def _landmark(seed: int, family: str) -> Landmark:
-    return Landmark.from_seed(seed, family)
+def _landmark(seed: int, family: str, weathered: bool) -> Landmark:
+    return Landmark.from_seed(seed, family, weathered)
 
 
 def _take(order: _Order) -> TakenPhoto:
     """Take one photo and write its files, in a worker."""
-    landmark = _landmark(order.seed, order.family)
+    landmark = _landmark(order.seed, order.family, order.weathered)
     if order.test_camera is not None:
         return _take_test_view(landmark, order.test_camera, order)
     view, width, height = photo_view(landmark, order.seed, order.number, order.wild, order.size)

@@ -12,6 +12,7 @@ from numpy import ndarray as Array
 from lab.landmark.materials import Material, fractal_noise
 from lab.landmark.raycast import Camera, SunCamera, cast
 from lab.landmark.shapes import Shape, floats
+from lab.landmark.weathering import own_place, stains, tint
 
 SHADOW_MAP = 256
 """Pixels per side of the shadow map, about 0.3 m each on a landmark of 40 m radius."""
@@ -39,6 +40,15 @@ class Weather:
     def to_sun(self) -> Float[Array, "3"]:
         azimuth, flat = self.sun_azimuth, np.cos(self.sun_elevation)
         return floats([np.cos(azimuth) * flat, np.sin(azimuth) * flat, np.sin(self.sun_elevation)])
+
+
+@dataclass(frozen=True)
+class Grain:
+    """Stains and grain of a weathered landmark in one photo."""
+
+    pixels: int
+    """Longer side of the photo."""
+    seed: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,8 +107,16 @@ class Traced:
         return picture.reshape(self.depth.shape)
 
 
-def trace(shapes: Sequence[Shape], camera: Camera, weather: Weather, width: int, height: int) -> Traced:
-    """Cast a ray through every pixel's center. The sun decides which recesses are lit."""
+def trace(
+    shapes: Sequence[Shape],
+    camera: Camera,
+    weather: Weather,
+    width: int,
+    height: int,
+    weathered: bool = False,
+) -> Traced:
+    """Cast a ray through every pixel's center. The sun decides which recesses are lit. Weathered copies of
+    walls and windows have textures of their own."""
     depth, index = cast(shapes, camera, width, height)
     order = np.argsort(index.ravel(), kind="stable")  # radix sort for int16
     pixel = order[np.searchsorted(index.ravel()[order], 0) :]
@@ -118,15 +136,26 @@ def trace(shapes: Sequence[Shape], camera: Camera, weather: Weather, width: int,
         surface = it.surface(it.point_to_local(tuple(at)), it.to_local(tuple(ray)), it.to_local(to_sun))
         traced.normal[run, 0], traced.normal[run, 1], traced.normal[run, 2] = it.to_world(surface.normal)
         traced.texture[0, run], traced.texture[1, run] = surface.s, surface.t
+        if weathered:
+            copy = np.broadcast_to(surface.copy, end - start)
+            traced.texture[:, run] += own_place(copy, int(shape[start]))
         traced.shade[run], traced.sunlit[run] = surface.shade, surface.sunlit
         traced.part[run] = it.part
         traced.element[run] = np.where(surface.element, it.element, 0)
         traced.material[run] = np.where(surface.trim, it.trim, it.material)
+        if weathered:
+            window = ~np.asarray(surface.trim) & (it.trim != it.material)
+            traced.shade[run] *= tint(copy, int(shape[start]), window)
     return traced
 
 
 def light(
-    traced: Traced, materials: Sequence[Material], camera: Camera, weather: Weather, shadows: ShadowMap
+    traced: Traced,
+    materials: Sequence[Material],
+    camera: Camera,
+    weather: Weather,
+    shadows: ShadowMap,
+    grain: Grain | None = None,
 ) -> Float[Array, "h w 3"]:
     """Compute the linear colors of all pixels: lit hits, and sky elsewhere."""
     height, width = traced.depth.shape
@@ -134,7 +163,7 @@ def light(
     sky[traced.pixel] = False
     color = np.empty((height * width, 3), np.float32)
     color[sky] = _sky(rays[sky], weather)
-    color[traced.pixel] = _lit(traced, materials, camera, weather, rays[traced.pixel], shadows)
+    color[traced.pixel] = _lit(traced, materials, camera, weather, rays[traced.pixel], shadows, grain)
     return color.reshape(height, width, 3)
 
 
@@ -144,13 +173,20 @@ def _flat(camera: Camera, width: int, height: int) -> Float[Array, "n 3"]:
 
 
 def _lit(
-    hits: Traced, materials, camera: Camera, weather: Weather, ray: Float[Array, "n 3"], shadows: ShadowMap
+    hits: Traced,
+    materials,
+    camera: Camera,
+    weather: Weather,
+    ray: Float[Array, "n 3"],
+    shadows: ShadowMap,
+    grain: Grain | None,
 ) -> Float[Array, "n 3"]:
     distance = hits.depth.ravel()[hits.pixel]
     length = np.sqrt((ray * ray).sum(axis=1))
     facing = -(ray * hits.normal).sum(axis=1) / length
     at = ray * distance[:, None] + camera.position.astype(np.float32)
-    pixel_size = distance / (camera.focal * 640)  # texture detail as in a medium-sized photo
+    pixels = 640 if grain is None else grain.pixels  # texture detail as in a medium-sized photo
+    pixel_size = distance / (camera.focal * pixels)
     footprint = pixel_size / np.maximum(facing, 0.15)
 
     color = np.empty((len(ray), 3), np.float32)
@@ -159,6 +195,8 @@ def _lit(
         own = np.flatnonzero(hits.material == i)
         color[own] = materials[i].reflectance(*hits.texture[:, own], footprint[own])
         gloss[own] = materials[i].gloss
+    if grain is not None:
+        color *= stains(at, footprint, grain.seed)[:, None]
 
     to_sun = weather.to_sun
     sunlight = np.clip(hits.normal @ to_sun, 0, 1) * hits.sunlit

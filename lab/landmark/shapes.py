@@ -40,6 +40,8 @@ class Surface:
     """True where the surface has the shape's `trim` material instead of its `material`."""
     element: Any = True
     """True where the shape's element applies. The stone surround of a window is not a window."""
+    copy: Any = 0
+    """Number of the exact copy within the shape: the side of a solid, the window of a row."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,7 +128,8 @@ class Box(Shape):
             np.where(axis == 1, np.sign(y), 0.0),
             np.where(axis == 2, np.where(z > sz / 2, 1.0, -1.0), 0.0),
         )
-        return Surface(normal, np.where(axis == 0, y, x), np.where(axis == 2, y, z))
+        side = 2 * axis + (np.choose(axis, (x, y, z - sz / 2)) > 0)
+        return Surface(normal, np.where(axis == 0, y, x), np.where(axis == 2, y, z), copy=side)
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,11 +158,12 @@ class Polytope(Shape):
         x, y, z = point
         planes = zip(self.normals.tolist(), self.offsets.tolist(), strict=True)
         gaps = np.stack([np.abs(nx * x + ny * y + nz * z - offset) for (nx, ny, nz), offset in planes])
-        nx, ny, nz = self.normals[gaps.argmin(axis=0)].T
+        side = gaps.argmin(axis=0)
+        nx, ny, nz = self.normals[side].T
         flat = np.abs(nz) > 0.98
         horizontal = np.maximum(np.hypot(nx, ny), 1e-6)
         s = np.where(flat, x, (y * nx - x * ny) / horizontal)
-        return Surface((nx, ny, nz), s, np.where(flat, y, z / horizontal))
+        return Surface((nx, ny, nz), s, np.where(flat, y, z / horizontal), copy=side)
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,13 +21,14 @@ from lang3dxl_ns.common.files import expanded, make_folder
 from lang3dxl_ns.common.stages import Stages
 from lang3dxl_ns.files.read_splats import find_splats, read_splats
 from lang3dxl_ns.files.scene_file import Provenance, check_scene_name, replace_scene
-from lang3dxl_ns.preparation.model_files import check_encoders, short_options
+from lang3dxl_ns.preparation.model_files import check_encoders
 from lang3dxl_ns.preparation.segmentation import find_text_segmenter, load_text_segmenter
 from lang3dxl_ns.query.match import save_picture
 from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.query.text import taught_prompt
 from lang3dxl_ns.rendering import Splats
 from lang3dxl_ns.scene.capture import Capture, open_capture
+from lang3dxl_ns.scene.companions import cache_folder
 from lang3dxl_ns.scene.photo_folder import check_data
 
 _LIGHT = 0.15
@@ -39,7 +40,6 @@ _NEAREST = 1.2e-4
 _SHARES = {"splat": 0.05, "frame": 0.15, "prepare": 0.5, "learn": 0.3}
 
 
-@short_options()
 def attach(
     splat: str | Path,
     data: str | Path | None = None,
@@ -99,7 +99,7 @@ def attach(
             collection = open_capture(data)
             similarity = _frame(splats, collection, path, place)
     with stages.stage("prepare"):
-        cache = expanded(config.cache_dir or collection.folder / "lang3dxl_cache")
+        cache = cache_folder(collection.folder, config.cache_dir)
         collection, targets = prepare_photos(collection, preparation, cache, worker)
     tracked = collection.reconstruction.photos
     cameras = {

@@ -82,7 +82,7 @@ def findings() -> Iterator[Finding]:
     yield from versions()
     yield from devices()
     disk, folders = shutil.disk_usage(Path.cwd()).free, "another folder: --output-dir, --cache-dir, HF_HOME"
-    cache, memory = "--pipeline.datamanager.cache-gb 0.2", machine_memory()
+    cache, memory = "--pipeline.datamanager.cache-gb 0.2 (ns-train)", machine_memory()
     yield Finding("memory", f"{memory / 1e9:.1f} GB", memory >= LEAST_MEMORY, f"little: use {cache}")
     yield Finding("free disk here", f"{disk / 1e9:.1f} GB", disk >= LEAST_DISK, f"little: use {folders}")
     ffmpeg = shutil.which("ffmpeg")

@@ -15,7 +15,7 @@ from lang3dxl_ns.preparation.settings import PreparationConfig
 from lang3dxl_ns.scene.reconstruction import ReconstructionSettings
 
 if TYPE_CHECKING:
-    from lang3dxl_ns.plugin.datamanager import Lang3DXLDataManager
+    from lang3dxl_ns.training.batches import TrainingData
 
 
 @showing("data", "features", "max_features", "one_camera")
@@ -57,21 +57,20 @@ class Prepare(PreparationConfig):
     or dense features with --dense none), and make none."""
 
     def main(self) -> None:
-        from lang3dxl_ns.preparation.model_files import check_encoders, option_prefix
+        from lang3dxl_ns.preparation.model_files import check_encoders
         from lang3dxl_ns.preparation.store import FeatureStore
         from lang3dxl_ns.scene.photo_folder import check_data
 
-        option_prefix.set("--")
         check_data(self.data)
         if not self.clean:
             check_encoders(self.clip, self.dense)
-        datamanager = _open_datamanager(self, self.data, self.cache_dir)
+        prepared = _opened(self, self.data, self.cache_dir)
         if self.clean:
-            files, freed = datamanager.clean_store()
-            print(f"Deleted {files} files, {freed / 1e6:.1f} MB, from {datamanager.cache_dir}")
-        elif datamanager.targets is not None:
-            print(f"Targets of {len(datamanager.targets.names)} photos are in {datamanager.cache_dir}")
-        for kind, (files, size) in FeatureStore(datamanager.cache_dir).sizes().items():
+            files, freed = prepared.clean_store()
+            print(f"Deleted {files} files, {freed / 1e6:.1f} MB, from {prepared.cache_dir}")
+        elif prepared.targets is not None:
+            print(f"Targets of {len(prepared.targets.names)} photos are in {prepared.cache_dir}")
+        for kind, (files, size) in FeatureStore(prepared.cache_dir).sizes().items():
             print(f"  {kind}: {files} files, {size / 1e6:.1f} MB")
 
 
@@ -91,24 +90,21 @@ class Needs(PreparationConfig):
 
         # Keep nerfstudio's start-up output out of the answer.
         with contextlib.redirect_stdout(sys.stderr):
-            table = needs_table(_open_datamanager(self, self.data, None).needs)
+            table = needs_table(_opened(self, self.data, None).needs)
         print(table)
 
 
-def _open_datamanager(settings: PreparationConfig, data: Path, cache_dir: Path | None) -> Lang3DXLDataManager:
-    """Open the data manager for a folder of photos with these settings. Nothing is prepared yet."""
+def _opened(settings: PreparationConfig, data: Path, cache_dir: Path | None) -> TrainingData:
+    """Open a folder of photos with these settings. Nothing is prepared yet."""
     from lang3dxl_ns.common.device import best_device
-    from lang3dxl_ns.plugin.datamanager import Lang3DXLDataManagerConfig
-    from lang3dxl_ns.plugin.dataparser import PhotoCollectionDataParserConfig
-    from lang3dxl_ns.preparation.model_files import option_prefix
+    from lang3dxl_ns.scene.capture import open_capture, say_left_out
+    from lang3dxl_ns.scene.companions import cache_folder
+    from lang3dxl_ns.training.batches import TrainingData, settle
 
-    option_prefix.set("--")
-    config = Lang3DXLDataManagerConfig(
-        dataparser=PhotoCollectionDataParserConfig(data=data),
-        data=data,
-        cache_dir=cache_dir,
-        **{f.name: getattr(settings, f.name) for f in fields(PreparationConfig)},
-    )
-    learned = config.crops == "pyramid" or config.regions not in ("auto", "none")
-    config.settle_targets(learned, gathered=not learned)
-    return config.setup(device=best_device(), test_mode="test")
+    settings.check()
+    capture = open_capture(data, cache_dir=cache_dir)
+    say_left_out(capture)
+    learned = settings.crops == "pyramid" or settings.regions not in ("auto", "none")
+    config = PreparationConfig(**{f.name: getattr(settings, f.name) for f in fields(PreparationConfig)})
+    settle(config, learned, gathered=not learned)
+    return TrainingData(capture, config, cache_folder(capture.folder, cache_dir), best_device(), learned)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shlex
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from typing import Annotated, Any
@@ -96,7 +96,7 @@ class Query:
         before = listed.stat().st_mtime_ns if listed.is_file() else 0
         scene = load_scene(self.scene, settings=self.settings, clip=self.clip)
         scene = scene.with_words(()) if self.without_taught else scene
-        question = scene.ask(prompts)
+        question = scene.ask(parse_texts(self.text, self.not_, scene.words))
         prompts = list(question.prompts)
         *folders, shared = (self.out / slug for slug in slugs([*(p.text for p in prompts), "together"]))
         labels, views = CocoLabels([prompt.text for prompt in prompts]), []
@@ -194,9 +194,11 @@ def _runs(part: Bool[Array, "r c"], place: tuple[slice, slice], size: tuple[int,
     return runs if runs[-1] else runs[:-1]
 
 
-def parse_texts(texts: Sequence[str], apart_from: Sequence[str] = ()) -> list[Prompt]:
-    """Parse the prompts of --text, each once and with the negatives of --not."""
-    prompts = dict.fromkeys(prompt for text in texts for prompt in parse_prompts(text))
+def parse_texts(
+    texts: Sequence[str], apart_from: Sequence[str] = (), names: Iterable[str] = ()
+) -> list[Prompt]:
+    """Parse the prompts of --text, each once and with the negatives of --not; `names` are never split."""
+    prompts = dict.fromkeys(prompt for text in texts for prompt in parse_prompts(text, names))
     rivals = listed_phrases(apart_from)
     return [replace(prompt, negatives=(*prompt.negatives, *rivals)) for prompt in prompts]
 
@@ -290,6 +292,7 @@ class Export:
             if len(prompts) > 1:
                 raise UserError("a splat file is of one --text: write several files, or a page (--web)")
         scene = load_scene(self.scene, settings=self.settings, clip=self.clip)
+        prompts = parse_texts(self.text, self.not_, scene.words)
         if self.scene_file is not None:
             _, size = replace_scene(self.scene_file, scene, self._told())
             ask = f"lang3dxl query {shlex.quote(str(self.scene_file))}"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import tyro
 
@@ -13,6 +13,9 @@ from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.settings_help import showing, without
 from lang3dxl_ns.preparation.settings import PreparationConfig
 from lang3dxl_ns.training.settings import SceneSettings
+
+if TYPE_CHECKING:
+    from lang3dxl_ns.training.fit import Settings
 
 
 @showing(
@@ -51,10 +54,19 @@ class Train(SceneSettings, PreparationConfig):
     """Train anew, over the run in the folder."""
 
     def main(self) -> None:
-        from lang3dxl_ns.preparation.model_files import option_prefix
-        from lang3dxl_ns.training.fit import Settings, run_folder
+        from lang3dxl_ns.training.fit import run_folder
 
-        option_prefix.set("--")
+        settings = self.settings()
+        folder, _ = run_folder(self.data, self.out, settings, self.cache_dir, self.restart)
+        run = shlex.quote(str(folder))
+        say(f"Walk through it: lang3dxl view {run}")
+        if settings.targets.clip != "none":
+            say(f"Ask it:          lang3dxl query {run} --text windows --out found")
+
+    def settings(self) -> Settings:
+        """Return the settings of the run: its method's usual ones, but for those that were given here."""
+        from lang3dxl_ns.training.fit import Settings
+
         settings = Settings.of(self.method, self.steps)
         for owner, kind in ((settings.scene, SceneSettings), (settings.targets, PreparationConfig)):
             for name, value in _changed(self, kind).items():
@@ -63,11 +75,7 @@ class Train(SceneSettings, PreparationConfig):
         settings.photo_scale = self.photo_scale or settings.photo_scale
         if self.looks != "auto":
             settings.scene.appearance.use = self.looks
-        folder, _ = run_folder(self.data, self.out, settings, self.cache_dir, self.restart)
-        run = shlex.quote(str(folder))
-        say(f"Walk through it: lang3dxl view {run}")
-        if settings.targets.clip != "none":
-            say(f"Ask it:          lang3dxl query {run} --text windows --out found")
+        return settings
 
 
 def _changed(settings: object, kind: type) -> dict[str, Any]:

@@ -19,6 +19,8 @@ from lang3dxl_ns.common.errors import UserError, readable
 
 _MOST_BYTES = 64 << 20
 """Largest file of settings, names or figures, bytes. Files of arrays have their own limits."""
+_LONGEST_PATH = 4000
+"""Longest path, bytes; systems allow 4,095, and temporary files have longer names."""
 
 
 def open_file(path: Path) -> BinaryIO:
@@ -78,6 +80,7 @@ def read_array(path: Path) -> Any:
 def write_atomically(path: Path, content: str | bytes) -> None:
     """Write a file that a user named, as `replace_file` does, but through a link, which stays a link. A
     device (/dev/stdout) or a pipe is written to, and never replaced by a file."""
+    path = expanded(path)
     make_folder(path.parent)
     if path.exists() and not path.is_file():
         path.write_bytes(content.encode() if isinstance(content, str) else content)
@@ -170,7 +173,10 @@ def make_folder(folder: Path) -> None:
 
 
 def expanded(path: str | Path) -> Path:
-    """Replace ~ in a path. Raises UserError for the home of an unknown user."""
+    """Replace ~ in a path. Raises UserError for the home of an unknown user, and for what no path can be."""
+    name = os.fsencode(path)
+    if b"\0" in name or len(name) > _LONGEST_PATH or any(len(part) > 255 for part in name.split(b"/")):
+        raise UserError(f"{os.fsdecode(name[:60])} … is no path: it is too long, or holds a null character")
     try:
         return Path(path).expanduser()
     except RuntimeError as error:

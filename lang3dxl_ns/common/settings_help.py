@@ -5,7 +5,8 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterable
 from dataclasses import fields
-from typing import Any, TypeVar, get_type_hints
+from types import NoneType
+from typing import Annotated, Any, TypeVar, get_args, get_type_hints
 
 import tyro
 
@@ -18,14 +19,31 @@ def without(*names: str) -> Callable[[Class], Class]:
 
 
 def showing(*names: str) -> Callable[[Class], Class]:
-    """Return a dataclass decorator that hides all but these settings from `--help`, not from `--help-all`."""
+    """Return a dataclass decorator that makes `--help` show these settings alone, in this order, the others
+    after `--help-all`."""
 
-    def hide(kind: Class) -> Class:
-        if not {"-h", "--help"} & set(sys.argv[1:]):  # tyro would not accept what it does not print
+    def arrange(kind: Class) -> Class:
+        if not {"-h", "--help", "--help-all"} & set(sys.argv[1:]):  # tyro would not accept what it hides
             return kind
-        return _marked(kind, tyro.conf.Suppress, [f.name for f in fields(kind) if f.name not in names])
+        own = {field.name: field for field in fields(kind)}
+        others = [name for name in own if name not in names]
+        arranged = {name: own[name] for name in (*names, *others)}
+        type.__setattr__(kind, "__dataclass_fields__", arranged)
+        _name_values(kind)
+        return kind if "--help-all" in sys.argv[1:] else _marked(kind, tyro.conf.Suppress, others)
 
-    return hide
+    return arrange
+
+
+def _name_values(kind: type) -> None:
+    """Describe the settings that may be absent by their values' kind alone: PATH instead of {None}|PATH."""
+    hints = get_type_hints(kind, include_extras=True)
+    for name in [field.name for field in fields(kind) if field.default is None]:
+        bare = getattr(hints[name], "__origin__", hints[name])  # without Annotated
+        kinds = [option for option in get_args(bare) if option is not NoneType]
+        if len(kinds) == 1 and isinstance(kinds[0], type):
+            shown = tyro.conf.arg(metavar=kinds[0].__name__.upper(), help_behavior_hint="")
+            kind.__annotations__[name] = Annotated[hints[name], shown]
 
 
 def _marked(kind: Class, mark: Any, names: Iterable[str]) -> Class:

@@ -260,11 +260,12 @@ class LanguageScorer(MapScorer):
 
     def __init__(self, truth: GroundTruth, encode_texts: EncodeTexts) -> None:
         super().__init__(truth)
+        self.encode_texts = encode_texts
         text = TextEncoder(encode_texts)
         self.queries = text.plain_queries(truth.categories)
         """Queries of the categories, in their order."""
         self.yardstick = text.yardstick
-        """Words that calibrate relevancies, from `TextEncoder.yardstick`."""
+        """Words that calibrate the relevancies of targets, from `TextEncoder.yardstick`."""
         published = TextEncoder(encode_texts, TextConfig(combine="joined", negatives=CANONICAL))
         self.published_queries = published.queries([Prompt(category) for category in truth.categories])
         """Queries as published: a specialist word joined with common ones, against canonical phrases."""

@@ -161,6 +161,8 @@ def _splats_of(table: Any) -> Splats:
     else:
         colors = columns("red", "green", "blue")  # 0 to 255, or 0 to 1
         first = harmonics_of(colors / (255 if (colors > 1).any() else 1))
+    if len(rest) not in (0, 9, 24, 45, 72):
+        raise UserError(f"it has {len(rest)} columns f_rest, not 9, 24, 45 or 72: export it anew")
     # Coefficients are stored channel by channel.
     others = columns(*rest).reshape(len(first), 3, len(rest) // 3).mT if rest else first[:, :0]
     scales = columns("scale_0", "scale_1")

@@ -63,7 +63,9 @@ def read_splats(path: str | Path) -> Splats:
     path = find_splats(path)
     reader = _READERS.get(path.suffix.lower())
     if reader is None:
-        raise UserError(f"{path.name} names no kind of splat: give {KINDS}")
+        raise UserError(
+            f"{path.name} is of no kind that can be read: give {KINDS}; SuperSplat makes a .ply of others"
+        )
     try:
         # gsplat on several GPUs leaves a file of each (ckpt_6999_rank1.pt).
         ranks = re.fullmatch(r"(ckpt_\d+_rank)\d+\.pt", path.name)

@@ -57,3 +57,12 @@ def photo_camera(camera: Cameras) -> PhotoCamera:
         int(camera.height.item()),
         (camera.metadata or {}).get("cam_idx"),
     )
+
+
+def to_cameras(view: PhotoCamera) -> Cameras:
+    """Convert a photo's camera to nerfstudio's, which a training step converts back (`photo_camera`)."""
+    k = view.intrinsics[None]
+    lens = k[:, 0, 0], k[:, 1, 1], k[:, 0, 2], k[:, 1, 2]
+    camera = Cameras(view.pose[None], *lens, torch.tensor([view.width]), torch.tensor([view.height]))
+    camera.metadata = {} if view.photo is None else {"cam_idx": view.photo}
+    return camera

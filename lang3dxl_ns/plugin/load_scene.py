@@ -12,6 +12,7 @@ from nerfstudio.data.scene_box import SceneBox
 
 from lang3dxl_ns.common.device import known_device
 from lang3dxl_ns.common.errors import UserError, readable
+from lang3dxl_ns.evaluation.score_run import NOT_FINISHED
 from lang3dxl_ns.files.runs import find_config
 from lang3dxl_ns.plugin.model import Lang3DXLModel, Lang3DXLModelConfig
 from lang3dxl_ns.plugin.run_checkpoint import latest_checkpoint
@@ -20,8 +21,6 @@ from lang3dxl_ns.preparation.targets import SceneFacts
 from lang3dxl_ns.query.question import QueryConfig
 from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.scene.record import SCENE_FILE, SceneRecord
-
-NOT_FINISHED = "this run has no semantics yet: they are learned when training ends; resume it (--load-dir)"
 
 
 def load_run(

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator
-
 import torch
 from jaxtyping import Float
-from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.datasets.base_dataset import InputDataset
 from nerfstudio.utils.rich_utils import CONSOLE
@@ -15,8 +12,6 @@ from torch import Tensor
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.plugin.cameras import to_nerfstudio
-from lang3dxl_ns.preparation.store import PhotosGoneError
-from lang3dxl_ns.preparation.targets import Batch
 from lang3dxl_ns.preparation.working_photos import WorkingPhotos
 from lang3dxl_ns.scene.photo import Photo
 
@@ -54,43 +49,3 @@ class PhotoDataset(InputDataset):
 
     def get_image_float32(self, image_idx: int) -> Float[Tensor, "h w 3"]:
         return self.read(image_idx)["image"].float() / 255
-
-
-class EvalPhotos:
-    """Photos of a dataset (default: all; else those with these names) as (camera, batch) pairs, one in memory
-    at a time; damaged ones are left out and logged. `ready` is called when iteration begins, and returns a
-    function that reads a photo by its index, and raises UserError for one that can't be used."""
-
-    def __init__(
-        self,
-        dataset: PhotoDataset,
-        ready: Callable[[], Callable[[int], tuple[Cameras, Batch]]],
-        names: Collection[str] | None = None,
-    ):
-        self.dataset, self._ready = dataset, ready
-        photos = enumerate(dataset.photos)
-        self._wanted = [index for index, photo in photos if names is None or photo.name in names]
-
-    def __len__(self) -> int:
-        return len(self._wanted)
-
-    def cameras(self) -> Iterator[tuple[Cameras, Photo]]:
-        """Yield every photo's camera and the photo, without reading files."""
-        for index in self._wanted:
-            yield self.dataset.cameras[index : index + 1], self.dataset.photos[index]
-
-    def __iter__(self) -> Iterator[tuple[Cameras, Batch]]:
-        read, usable = self._ready(), False
-        for index in self._wanted:
-            try:
-                item = read(index)
-            except PhotosGoneError:
-                raise
-            except UserError as reason:
-                name = self.dataset.photos[index].name
-                CONSOLE.log(escape(f"{name} is left out: {reason}"))
-                continue
-            usable = True
-            yield item
-        if not usable:
-            raise UserError("none of the photos can be used: see the reasons above")

@@ -19,13 +19,15 @@ from torch import Tensor
 from lang3dxl_ns.common.checks import disk_trouble
 from lang3dxl_ns.common.console import accept_any_console, say
 from lang3dxl_ns.common.errors import UserError, readable
+from lang3dxl_ns.evaluation.score_run import Evaluation, EvaluationSettings
 from lang3dxl_ns.plugin.datamanager import Lang3DXLDataManager, Lang3DXLDataManagerConfig
-from lang3dxl_ns.plugin.evaluation import Evaluation, EvaluationSettings
+from lang3dxl_ns.plugin.dataparser import RecordedSceneDataParserConfig
 from lang3dxl_ns.plugin.load_scene import model_state
 from lang3dxl_ns.plugin.model import Lang3DXLModel, Lang3DXLModelConfig
 from lang3dxl_ns.plugin.panel import AskPanel
 from lang3dxl_ns.plugin.rendering_model import RenderedAnswers
 from lang3dxl_ns.scene.record import SCENE_FILE, SceneRecord
+from lang3dxl_ns.training.learn_codes import learn_words
 
 QUERY_VARIABLE = "LANG3DXL_QUERY"
 
@@ -59,8 +61,14 @@ class Lang3DXLPipeline(VanillaPipeline):
 
     @cached_property
     def evaluation(self) -> Evaluation:
-        """Evaluation of the present model."""
-        return Evaluation(self.model, self.datamanager, self.config)
+        """Evaluation of the present model. Raises UserError for a run whose photos are gone."""
+        if isinstance(self.datamanager.config.dataparser, RecordedSceneDataParserConfig):
+            raise UserError(
+                "this run can't be evaluated without the photos that it was trained on (see above): restore "
+                "them, or correct data in its config.yml. `lang3dxl evaluate run NAME.scene --ground-truth "
+                "FOLDER` scores its words alone"
+            )
+        return Evaluation(self.model.run, self.datamanager.data, self.config)
 
     def get_average_eval_image_metrics(
         self, step: int | None = None, output_path: Path | None = None, get_std: bool = False
@@ -94,7 +102,7 @@ class Lang3DXLPipeline(VanillaPipeline):
         run = self.datamanager.config.run
         if run is not None and (run / SCENE_FILE).is_file():
             return SceneRecord.read(run / SCENE_FILE)
-        return self.datamanager.scene_file()
+        return self.datamanager.data.record()
 
     def load_pipeline(self, loaded_state: dict[str, Any], step: int) -> None:
         """Load a checkpoint; for rendering, also prepare to answer the configured prompts."""
@@ -114,12 +122,7 @@ class Lang3DXLPipeline(VanillaPipeline):
 
     def learn_words(self) -> None:
         """Gather the training photos' features onto the present Gaussians, and learn codes."""
-        data, training = self.datamanager, self.model.training
-        self.model.train()
-        try:
-            self.model.learn_from_photos(data.train_photos(), len(data.train_dataset))
-        finally:
-            self.model.train(training)
+        learn_words(self.model.run, self.datamanager.data.every_photo(), len(self.datamanager.train_dataset))
 
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool | None = None) -> None:  # type: ignore[override]
         """Load a checkpoint; any mismatch is an error (nerfstudio would silently ignore it)."""

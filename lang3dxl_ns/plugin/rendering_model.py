@@ -222,10 +222,6 @@ class RenderingModel(SplatfactoModel):
         CPU."""
         return self.run.pose(photo_camera(camera))
 
-    def refined(self, poses: Float[Tensor, "k 3 4"], photos: slice) -> Float[Tensor, "k 3 4"]:
-        """Apply training's corrections to the poses (camera → world) of some training photos."""
-        return poses if self.run.parts.cameras is None else self.run.parts.cameras(poses, photos)
-
 
 class ViewersCameras(CameraOptimizer):
     """Refined cameras for nerfstudio's viewer, which always asks for a camera optimizer."""

@@ -18,6 +18,7 @@ from types import FrameType
 from typing import Any, Literal
 
 import torch
+from nerfstudio.engine.callbacks import TrainingCallbackLocation
 from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.engine.trainer import Trainer
 from nerfstudio.utils import writer
@@ -155,9 +156,9 @@ class Lang3DXLTrainer(Trainer):
         for optimizer in self.optimizers.optimizers.values():
             add_rows_to_state(optimizer)
         if self.local_rank == 0:
-            self.pipeline.datamanager.scene_file().write(self.base_dir / SCENE_FILE)
+            self.pipeline.datamanager.data.record().write(self.base_dir / SCENE_FILE)
             if test_mode == "val":
-                write_needs(self.pipeline.datamanager.needs, self.base_dir)
+                write_needs(self.pipeline.datamanager.data.needs, self.base_dir)
         model, cameras = self.pipeline.model, self.pipeline.datamanager.train_dataset.cameras
         pixels, wanted = int((cameras.width * cameras.height).max()), self.config.pipeline.model.max_gaussians
         model.run.densification.most, message = plan(model.run, pixels, torch.device(self.device), wanted)
@@ -212,10 +213,11 @@ class Lang3DXLTrainer(Trainer):
     def _check_photos(self, path: Path, before: SceneRecord, corrected: bool) -> None:
         """Check that a checkpoint's photos are this run's. Raises UserError for another frame, and, if the
         cameras were `corrected` one by one, for other training photos."""
-        data = self.pipeline.datamanager
-        if not before.has_frame(data.frame.transform, data.frame.scale):
+        data = self.pipeline.datamanager.data
+        frame = data.capture.recorded_frame
+        if not before.has_frame(frame.transform, frame.scale):
             raise UserError(f"{path} is of other photos, or of another reconstruction of them: train anew")
-        splits = [{p.name: p.split for p in file.photos} for file in (before, data.scene_file())]
+        splits = [{p.name: p.split for p in file.photos} for file in (before, data.record())]
         trained = [[name for name, split in known.items() if split == "train"] for known in splits]
         if corrected and trained[0] != trained[1]:
             raise UserError(
@@ -247,7 +249,7 @@ class Lang3DXLTrainer(Trainer):
         scale = grad_scaler.get_scale()
         sound = self.guard.allows(
             self.step,
-            self.pipeline.datamanager.photo_in_hand,
+            self.pipeline.datamanager.data.photo_in_hand,
             self.pipeline.last_losses,
             self.optimizers.live_parameters(),
             scale,
@@ -406,18 +408,25 @@ class Lang3DXLTrainer(Trainer):
         if self.interrupted:
             self.config.viewer.quit_on_train_completion = True
             CONSOLE.print(self._how_to_resume(self.step), soft_wrap=True)
-        super()._after_train()  # saves first
+        # As nerfstudio's own, but its tables come before the lines that say what to do next.
+        self.training_state = "completed"
+        writer.write_out_storage()
+        self.save_checkpoint(self.step)
+        for callback in self.callbacks:
+            callback.run_callback_at_location(self.step, TrainingCallbackLocation.AFTER_TRAIN)
+        if not self.config.viewer.quit_on_train_completion:
+            self._train_complete_viewer()
 
     def write_scene(self) -> None:
         """Write the trained scene as one file into the run's folder, for queries and sharing. It keeps the
         words taught in an earlier file there, or in the folder of the run that this one resumed."""
-        data, model = self.pipeline.datamanager, self.pipeline.model
-        path = self.base_dir / f"{data.data_folder.name or 'scene'}{SUFFIX}"
+        data, model = self.pipeline.datamanager.data, self.pipeline.model
+        path = self.base_dir / f"{data.capture.folder.name or 'scene'}{SUFFIX}"
         config, place = model.config, self.config.load_checkpoint
         how = f"{self.config.method_name}, {config.decoder.name}, {config.total_steps} iterations"
         with torch.no_grad():
-            poses = model.refined(data.train_dataset.cameras.camera_to_worlds, slice(None))
-        file = data.scene_file(poses)
+            poses = torch.stack([model.run.pose(view) for view in data.cameras]).cpu()
+        file = data.record(poses)
         file.write(self.base_dir / SCENE_FILE)
         scene = model.scene(file)
         checkpoints = self.config.load_dir or (place and place.parent)
@@ -486,10 +495,10 @@ class Lang3DXLTrainer(Trainer):
 
 def _run_state(pipeline: Lang3DXLPipeline) -> dict[str, Any]:
     """Collect the run's progress and the current round through the photos."""
-    return pipeline.model.run.progress() | {"photos": pipeline.datamanager.round_state()}
+    return pipeline.model.run.progress() | {"photos": pipeline.datamanager.data.state()}
 
 
 def _restore(pipeline: Lang3DXLPipeline, state: dict[str, Any]) -> None:
     """Restore `_run_state` on the pipeline's device, whichever device it was saved from."""
-    pipeline.datamanager.restore_round(state["photos"])
+    pipeline.datamanager.data.restore(state["photos"])
     pipeline.model.run.restore(state)

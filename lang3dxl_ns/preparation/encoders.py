@@ -17,6 +17,7 @@ from torch import Tensor
 
 from lang3dxl_ns.common.device import multiplies_bfloat16
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.options import data_option
 from lang3dxl_ns.preparation.families import (
     FAMILIES,
     Family,
@@ -36,7 +37,6 @@ from lang3dxl_ns.preparation.model_files import (
     has_files,
     load_weights,
     read_config,
-    spoken,
     whole,
 )
 from lang3dxl_ns.preparation.settings import DENSE_MODEL, PreparationConfig
@@ -181,8 +181,8 @@ def _family(files: ModelFiles) -> Family:
     kind = read_config(files).model_type
     if kind not in FAMILIES:
         raise UserError(
-            f"{files.name} is a {kind} model: {spoken(files.option)} needs an image-text encoder in Hugging "
-            f"Face format ({', '.join(FAMILIES)}), such as openai/clip-vit-base-patch32"
+            f"{files.name} is a {kind} model: {data_option(files.option)} needs an image-text encoder in "
+            f"Hugging Face format ({', '.join(FAMILIES)}), such as openai/clip-vit-base-patch32"
         )
     return FAMILIES[kind]
 
@@ -281,7 +281,7 @@ def load_dense_encoder(name_or_dir: str | Path, device: torch.device | str, toke
     if not isinstance(getattr(model.config, "patch_size", None), int):
         raise UserError(
             f"{files.name} is a {model.config.model_type} model without patch tokens: give "
-            f'{spoken(files.option)} a vision transformer such as facebook/dinov2-small, or "none"'
+            f'{data_option(files.option)} a vision transformer such as facebook/dinov2-small, or "none"'
         )
     return DenseEncoder(model, tokens, files.identity)
 

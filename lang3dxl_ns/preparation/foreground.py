@@ -18,6 +18,7 @@ import torch
 
 from lang3dxl_ns.common.console import some, tracked
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.options import data_option
 from lang3dxl_ns.common.pictures import NoPictureError, mask_values, open_picture
 from lang3dxl_ns.preparation.segmentation import find_text_segmenter, load_text_segmenter
 from lang3dxl_ns.preparation.settings import PreparationConfig
@@ -93,7 +94,7 @@ def _checked(photos: list[Photo], skip: bool, log: Log) -> list[Photo]:
     if damaged and not skip:
         raise UserError(
             f"{len(damaged)} masks can't be read: {'; '.join(damaged.values())}. Replace or remove them, or "
-            "let these photos count whole: --pipeline.datamanager.skip-damaged-masks True"
+            f"let these photos count whole: {data_option('skip-damaged-masks')} True"
         )
     if damaged:
         log(f"{len(damaged)} masks can't be read, and their photos count whole: {some(list(damaged))}")
@@ -101,9 +102,8 @@ def _checked(photos: list[Photo], skip: bool, log: Log) -> list[Photo]:
         most = max(dark.values())
         how = f"dark (the brightest pixel has {most} of 255)" if most else "black"
         raise UserError(
-            f"all {len(dark)} masks are {how}: nothing would count, since white (255) is what to keep. Draw "
-            "it "
-            "white, or pass --pipeline.datamanager.foreground none"
+            f"all {len(dark)} masks are {how}: nothing would count, since white (255) is what to keep. "
+            f"Draw it white, or pass {data_option('foreground')} none"
         )
     if dark:
         log(f"the masks of {len(dark)} photos are black or dark, nothing in them counts: {some(list(dark))}")
@@ -136,7 +136,7 @@ def _prompted(
     """Make missing or outdated masks and return the photos with them. Photos in which nothing is found are
     logged and used whole."""
     if not config.foreground_prompts:
-        raise UserError("foreground text needs prompts: --pipeline.datamanager.foreground-prompts building")
+        raise UserError(f"foreground text needs prompts: {data_option('foreground-prompts')} building")
     files = find_text_segmenter(config.foreground_model, config.sam)
     made_with = {"prompts": sorted(config.foreground_prompts), "model": files.identity, "rule": _RULE}
     paths, missing = dict[str, Path](), []

@@ -6,9 +6,6 @@ Code that comes with a model is never run, and weights are read as plain tensors
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator
-from contextlib import contextmanager
-from contextvars import ContextVar
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
@@ -18,17 +15,14 @@ import torch
 
 from lang3dxl_ns.common.errors import UserError, readable
 from lang3dxl_ns.common.files import check_regular, expanded
+from lang3dxl_ns.common.options import data_option
 
-CLIP_OPTION = "--pipeline.datamanager.clip"
-DENSE_OPTION = "--pipeline.datamanager.dense"
+CLIP_OPTION, DENSE_OPTION = "clip", "dense"
 
 BUILTIN = "builtin"
 """Name of the small encoders that ship with this package."""
 USUAL_CLIP = "openai/clip-vit-base-patch32"
 """CLIP that "auto" chooses where it was downloaded before."""
-_PREFIX = "--pipeline.datamanager."
-option_prefix: ContextVar[str] = ContextVar("option_prefix", default=_PREFIX)
-"""Prefix of the options in the current command; `lang3dxl prepare` has none."""
 _DEMO = Path(__file__).parents[1] / "demo"
 _BUILTIN_FOLDERS = {CLIP_OPTION: _DEMO / "clip", DENSE_OPTION: _DEMO / "dense"}
 _WEIGHTS = ("model*.safetensors", "pytorch_model*.bin")  # the first that exists is used
@@ -49,7 +43,7 @@ class ModelFiles:
     identity: str
     """Fingerprint of configuration and weights, not of the name, so targets stay valid if the model moves."""
     option: str
-    """Command-line option that chose the model, for messages."""
+    """Name of the option that chose the model, for messages."""
 
     @property
     def clip_identity(self) -> str:
@@ -108,30 +102,15 @@ def check_encoders(clip: str, dense: str) -> None:
     if missing:
         folders = {option: f"DIR/{name.split('/')[-1]}" for option, name in missing.items()}
         fetch = "; ".join(f"hf download {missing[o]} --local-dir {folders[o]}" for o in missing)
-        use = " ".join(f"{spoken(option)} {folder}" for option, folder in folders.items())
-        small = f"use the small encoders that come with this package: {spoken(CLIP_OPTION)} {BUILTIN}"
-        without = f"do without dense features, which makes words less sharp: {spoken(DENSE_OPTION)} none"
+        use = " ".join(f"{data_option(option)} {folder}" for option, folder in folders.items())
+        small = f"use the small encoders that come with this package: {data_option(CLIP_OPTION)} {BUILTIN}"
+        without = f"do without dense features, which makes words less sharp: {data_option(DENSE_OPTION)} none"
         way_out = small if CLIP_OPTION in missing else without
         raise UserError(
             f"{' and '.join(missing.values())}: neither folders here nor in the Hugging Face cache, and "
             f"the download fails. Either {way_out}. Or, on a machine with Internet: {fetch}; copy DIR here, "
             f"and use {use}"
         )
-
-
-def spoken(option: str) -> str:
-    """Return an option as spelled in the current command."""
-    return option.replace(_PREFIX, option_prefix.get())
-
-
-@contextmanager
-def short_options() -> Iterator[None]:
-    """Spell options in messages without their prefix in `ns-train`, until the block or function ends."""
-    token = option_prefix.set("--")
-    try:
-        yield
-    finally:
-        option_prefix.reset(token)
 
 
 def load_weights(model_class: Any, files: ModelFiles, device: torch.device | str) -> Any:
@@ -142,7 +121,7 @@ def load_weights(model_class: Any, files: ModelFiles, device: torch.device | str
     logging.disable_progress_bar()  # loading takes a second, and its bar would draw over ours
     logging.set_verbosity_error()  # it logs tables of tensors; missing ones are reported below
     read_config(files)
-    remedy = f"download it again, or give {spoken(files.option)} another folder"
+    remedy = f"download it again, or give {data_option(files.option)} another folder"
     with whole(f"{files.name}: the model in {files.folder} can't be loaded", remedy):
         model, report = model_class.from_pretrained(
             files.folder,
@@ -155,7 +134,7 @@ def load_weights(model_class: Any, files: ModelFiles, device: torch.device | str
     if missing:
         raise UserError(
             f"{files.name}: the weights in {files.folder} lack {len(missing)} tensors, the first being "
-            f"{missing[0]}: give {spoken(files.option)} a complete model"
+            f"{missing[0]}: give {data_option(files.option)} a complete model"
         )
     return model.to(device).eval().requires_grad_(False)
 
@@ -203,7 +182,7 @@ def _download(name: str, option: str) -> Path:
         raise _NotDownloaded(
             f"the model {name} is neither a folder here nor in the Hugging Face cache, and it can't be "
             f"downloaded ({type(error).__name__}). On a machine with Internet: "
-            f"hf download {name} --local-dir DIR; then {spoken(option)} DIR"
+            f"hf download {name} --local-dir DIR; then {data_option(option)} DIR"
         ) from error
     raise UserError(f"the model {name} has no PyTorch weights ({' or '.join(_WEIGHTS)}): choose another")
 
@@ -220,7 +199,7 @@ def _fingerprint(folder: Path, option: str) -> str:
     if not config.is_file() or not weights:
         raise UserError(
             f"{folder} is not a model in Hugging Face format: it needs config.json and "
-            f"{' or '.join(_WEIGHTS)}; give {spoken(option)} the folder that holds them"
+            f"{' or '.join(_WEIGHTS)}; give {data_option(option)} the folder that holds them"
         )
     for path in (path for pattern in (*_FILES, *_WEIGHTS) for path in folder.glob(pattern)):
         try:

@@ -16,8 +16,8 @@ from numpy import ndarray as Array
 
 from lang3dxl_ns.common.console import some
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.options import data_option
 from lang3dxl_ns.common.presets import load_preset
-from lang3dxl_ns.preparation.model_files import spoken
 from lang3dxl_ns.preparation.settings import AngleRule, DistanceRule, PreparationConfig
 from lang3dxl_ns.scene.colmap import Reconstruction, TrackedPhoto
 from lang3dxl_ns.scene.photo import Photo
@@ -217,7 +217,7 @@ def plan_crops(
     if config.scale_mode == "physical" and not len(reconstruction.points):
         raise UserError(
             "crops of physical size need 3D points, and the scene has none: reconstruct it with COLMAP, or "
-            "pass --pipeline.datamanager.scale-mode auto"
+            f"pass {data_option('scale-mode')} auto"
         )
     if config.scale_mode == "relative" or not len(reconstruction.points):
         replace(config, scale_mode="relative").check()  # a configured range may be meant in world units
@@ -229,10 +229,7 @@ def plan_crops(
     sizes, untracked = pixel_sizes(reconstruction, config.pixel_distance, config.pixel_angle)
     chosen = _scale_range(config, reconstruction, sizes)
     scales = _resampled(physical_scales(chosen.smallest, chosen.largest), config)
-    reasons = [
-        f"{chosen.reason}; crop sides: {_listed(scales)} "
-        f"({spoken('--pipeline.datamanager.scale-range')} overrides)"
-    ]
+    reasons = [f"{chosen.reason}; crop sides: {_listed(scales)} ({data_option('scale-range')} overrides)"]
     if untracked:
         reasons.append(
             f"{len(untracked)} photos have no tracked points: their scale is that of the points in view, "

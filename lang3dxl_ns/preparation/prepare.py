@@ -6,7 +6,6 @@ were made with other settings, so an interrupted run can simply be repeated.
 
 from __future__ import annotations
 
-import math
 import shutil
 import time
 from collections import deque
@@ -16,29 +15,17 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import UInt8
 from torch import Tensor
 
 from lang3dxl_ns.common.console import say, some, tracked
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.options import data_option
 from lang3dxl_ns.common.stages import roughly
 from lang3dxl_ns.preparation import workers
-from lang3dxl_ns.preparation.dense_map import (
-    RULE,
-    Grid,
-    build_dense_map,
-    map_grids,
-    nested_grids,
-    window_starts,
-)
-from lang3dxl_ns.preparation.encoders import (
-    DenseEncoder,
-    ImageTextEncoder,
-    load_dense_encoder,
-    load_image_text_encoder,
-    patch_reading,
-)
+from lang3dxl_ns.preparation.encoders import patch_reading
 from lang3dxl_ns.preparation.families import input_side
+from lang3dxl_ns.preparation.kinds import Networks, Sources, Target
 from lang3dxl_ns.preparation.model_files import (
     BUILTIN,
     CLIP_OPTION,
@@ -46,26 +33,23 @@ from lang3dxl_ns.preparation.model_files import (
     USUAL_CLIP,
     find_model,
     read_config,
-    spoken,
 )
-from lang3dxl_ns.preparation.pyramid import THIRD, Crops, build_clip_target, choose_crops
-from lang3dxl_ns.preparation.regions import RegionSource, label_size, stored_labels
+from lang3dxl_ns.preparation.pyramid import Crops, choose_crops
+from lang3dxl_ns.preparation.regions import RegionSource
 from lang3dxl_ns.preparation.settings import PreparationConfig, Quality
 from lang3dxl_ns.preparation.store import FeatureStore
 from lang3dxl_ns.preparation.targets import CLIP, DENSE, FINE, REGIONS, TargetReader
 from lang3dxl_ns.preparation.working_photos import WorkingPhotos
 from lang3dxl_ns.scene.photo import Photo
 
-_CROP_RULE = 4
-"""Increased when crops, their encoding or their average change, so that older entries are made again."""
 _READERS = 2
 """Threads that read photos while others are encoded."""
 _ANNOUNCED_CROPS = 5_000
 """Smallest number of crops whose duration is measured and announced. Fewer are encoded in seconds."""
 _MEASURED_S = 3.0
 """Seconds after which the measurement with noise ends, which is the basis of the announced duration."""
-_PATCHES_PER_CROP = 6
-"""Patches encoded at once per crop of a batch. Windows are fewer than crops, since they take more memory."""
+_BYTES = 2
+"""Bytes of a stored number."""
 _LONG_S = 1800.0
 """Duration on a CPU, in seconds, above which ways to shorten it are suggested."""
 
@@ -75,38 +59,8 @@ class _Task:
     """A photo, its targets, and those that are still to be made."""
 
     photo: Photo
-    crops: Crops
-    fast: int
-    """Number of crops with `--quality fast`."""
-    grids: tuple[Grid, ...] | None
-    """Grids of the map of patch features, coarse to fine; None if crops are encoded instead."""
-    settings: dict[str, dict[str, Any]]
-    """Settings of all the photo's targets, by kind."""
-    missing: dict[str, dict[str, Any]]
-    """Those of the targets to make."""
-
-    @property
-    def clip(self) -> str | None:
-        """Kind of CLIP target to make; None if it is complete."""
-        return next((kind for kind in (CLIP, FINE) if kind in self.missing), None)
-
-    def encoded(self, tokens: int) -> int:
-        """Count the pictures to encode: crops, or windows of `tokens` patches per side."""
-        if not self.grids:
-            return self.crops.count(self.photo.height, self.photo.width)
-        return sum(math.prod(len(window_starts(side, tokens)) for side in grid) for grid in self.grids)
-
-    def bytes(self, clip: ImageTextEncoder | None, dense: DenseEncoder | None) -> int:
-        """Compute the size of the entries to make, at two bytes per number."""
-        height, width, numbers = self.photo.height, self.photo.width, 0
-        if self.clip and clip:
-            grid = self.grids[-1] if self.grids else self.crops.grid(height, width)
-            numbers += math.prod(grid) * (clip.dim + 1)
-        if DENSE in self.missing and dense:
-            numbers += dense.tokens**2 * dense.dim
-        if REGIONS in self.missing:
-            numbers += math.prod(label_size(height, width))
-        return 2 * numbers
+    targets: list[Target]
+    missing: list[Target]
 
 
 def prepare(
@@ -136,14 +90,18 @@ def prepare(
         if config.clip == BUILTIN:
             say(
                 "Using the built-in CLIP, which knows landmarks and street façades and nothing else. For any "
-                f"word: {spoken(CLIP_OPTION)} {USUAL_CLIP} (a download of 600 MB)"
+                f"word: {data_option('clip')} {USUAL_CLIP} (a download of 600 MB)"
             )
         maker.announce(len(tasks), str(device))
         made = workers.run(config, maker.start, missing, str(device))
         for task, trouble in tracked(made, "encoding photos", len(missing)):
             if trouble:
                 left_out[task.photo.name] = trouble
-    made_with = {t.photo.name: t.settings for t in tasks if t.photo.name not in left_out}
+    made_with = {
+        task.photo.name: {target.kind: target.recipe for target in task.targets}
+        for task in tasks
+        if task.photo.name not in left_out
+    }
     if not made_with:
         first = next(iter(left_out.values()), "the scene has none")
         raise UserError(f"no photo can be prepared; the first of {len(photos)}: {first}")
@@ -162,49 +120,27 @@ def _plan(
     fine: Collection[str],
 ) -> tuple[list[_Task], dict[str, str]]:
     """Plan a task per photo, and collect the reasons for photos that cannot be read."""
-    clip_model = find_model(config.clip, CLIP_OPTION)
+    clip = find_model(config.clip, CLIP_OPTION)
     patches = patch_reading(config.clip, config.clip_features)
-    input_pixels = input_side(read_config(clip_model).vision_config)
-    dense_model = find_model(config.dense, DENSE_OPTION).identity if config.makes_dense else None
+    dense = find_model(config.dense, DENSE_OPTION).identity if config.makes_dense else None
+    sources = Sources(clip.identity, patches, dense, config.dense_tokens, regions, fine)
+    input_pixels = input_side(read_config(clip).vision_config)
+
+    def crops(photo: Photo, quality: Quality) -> Crops:
+        pixel_size = 1 / photo.width if pixel_sizes is None else pixel_sizes[photo.name]
+        size = photo.width, photo.height
+        return choose_crops(scales, pixel_size, size, photo.name in fine, input_pixels, quality)
+
     tasks, left_out = [], {}
     for photo, content in zip(photos, store.photo_hashes(photos).values(), strict=True):
         if isinstance(content, UserError):
             left_out[photo.name] = str(content)
             continue
-        is_fine, size = photo.name in fine, (photo.width, photo.height)
-        pixel_size = 1 / photo.width if pixel_sizes is None else pixel_sizes[photo.name]
-        qualities: tuple[Quality, Quality] = config.quality, "fast"
-        crops, fast = (
-            choose_crops(scales, pixel_size, size, is_fine, input_pixels, quality) for quality in qualities
-        )
-        grids: tuple[Grid, ...] | None = None
-        # Everything that determines the photo's pixels; the lens matters only if it is undistorted.
-        source: dict[str, Any] = {"photo": content, "size": [*size], "undistorted": photo.lens.undistortion}
-        if photo.quarter_turns:
-            source["turned"] = photo.quarter_turns
-        clip = {**source, "encoder": clip_model.identity}
-        if patches is not None and (is_fine or not patches.fine_alone):
-            if patches.sizes is None:
-                grids = map_grids(photo.height, photo.width, patches.tokens, config.dense_tokens)
-            else:
-                side = crops.sides[0]
-                grids = nested_grids(photo.height, photo.width, patches.tokens, side, patches.sizes)
-            cells = grids if patches.sizes is None else grids[-1:]
-            clip["crop_sides"] = sorted(math.ceil(photo.width / columns) for _, columns in cells)
-            clip |= {"patches": patches.recipe, "grids": grids, "rule": RULE}
-        else:
-            clip |= {"crop_sides": crops.sides, "rule": _CROP_RULE}
-            if is_fine and crops.steps != THIRD:
-                clip["steps"] = crops.steps
-        settings = {FINE if is_fine else CLIP: clip}
-        if dense_model is not None and (is_fine or not fine):
-            settings[DENSE] = {**source, "encoder": dense_model, "tokens": config.dense_tokens}
-        if regions is not None and (labels := regions.settings(photo)) is not None:
-            settings[REGIONS] = {**source, **labels}
-        missing = {kind: s for kind, s in settings.items() if not store.is_current(kind, photo.name, s)}
-        fast_count = fast.count(photo.height, photo.width)
-        tasks.append(_Task(photo, crops, fast_count, grids, settings, missing))
-    without = [task.photo.name for task in tasks if REGIONS not in task.settings]
+        asked, fast = crops(photo, config.quality), crops(photo, "fast")
+        targets = list(sources.targets_of(photo, content, asked, fast))
+        missing = [t for t in targets if not store.is_current(t.kind, photo.name, t.recipe)]
+        tasks.append(_Task(photo, targets, missing))
+    without = [t.photo.name for t in tasks if all(target.kind != REGIONS for target in t.targets)]
     if regions is not None and without:
         say(f"{len(without)} of {len(tasks)} photos have no regions: {some(without)}")
     return tasks, left_out
@@ -238,26 +174,23 @@ class _Maker:
         tasks: list[_Task],
     ) -> None:
         self._config, self._store, self._regions, self._tasks = config, store, regions, tasks
-        self._with_clip = any(task.clip for task in tasks)
-        self._with_dense = any(DENSE in task.missing for task in tasks)
-        self._models: tuple[ImageTextEncoder | None, DenseEncoder | None] | None = None
+        self._kinds = {target.kind for task in tasks for target in task.missing}
+        self._loaded: Networks | None = None
 
     def __getstate__(self) -> dict[str, Any]:
         # A process loads its own networks, and does not know which photos it will get.
-        return {**self.__dict__, "_tasks": [], "_models": None}
+        return {**self.__dict__, "_tasks": [], "_loaded": None}
 
-    def models(self, device: str) -> tuple[ImageTextEncoder | None, DenseEncoder | None]:
+    def networks(self, device: str) -> Networks:
         """Load the encoders that are needed, on the first call only."""
-        if self._models is None:
-            c = self._config
-            clip = load_image_text_encoder(c.clip, device) if self._with_clip else None
-            dense = load_dense_encoder(c.dense, device, c.dense_tokens) if self._with_dense else None
-            self._models = clip, dense
-        return self._models
+        if self._loaded is None:
+            self._loaded = Networks(self._config, self._regions, device)
+            self._loaded.load(self._kinds)
+        return self._loaded
 
     def start(self, device: str) -> Callable[[_Task], str | None]:
         """Start a worker, as a `workers.Start`. The work returns why a photo cannot be read, or None."""
-        self.models(device)
+        networks = self.networks(device)
         photos = _ReadAhead(WorkingPhotos(self._store).read, self._tasks)
 
         def work(task: _Task) -> str | None:
@@ -266,39 +199,19 @@ class _Maker:
             except UserError as error:
                 return str(error)
             image = pixels.to(device).float() / 255  # as bytes, a quarter of the data is copied to a GPU
-            for kind, settings in task.missing.items():
-                self._store.write(kind, task.photo.name, self._made(kind, task, image), settings)
+            for target in task.missing:
+                self._store.write(target.kind, task.photo.name, target.make(image, networks), target.recipe)
             return None
 
         return work
 
-    def _made(self, kind: str, task: _Task, image: Float[Tensor, "h w 3"]) -> dict[str, Tensor]:
-        """Make the tensors of an entry."""
-        assert self._models is not None
-        clip, dense = self._models
-        if kind == REGIONS:
-            assert self._regions is not None
-            return {"labels": stored_labels(self._regions.labels(task.photo, image))}
-        if kind == DENSE:
-            assert dense is not None
-            return {"features": dense.encode(image)}
-        assert clip is not None
-        lit, batch, size = clip.in_known_light(image), self._config.crop_batch, clip.crop_size
-        if not task.grids:
-            crops = task.crops
-            return vars(build_clip_target(lit, crops.sides, clip.encode_images, size, batch, crops.steps))
-        tokens, patch = size // clip.patch_size, clip.patch_size
-        windows = max(_PATCHES_PER_CROP * batch // tokens**2, 1)
-        features = build_dense_map(
-            lit, task.grids, clip.encode_patches, tokens, patch, windows, clip.join_sizes
-        )
-        return {"features": features, "valid": torch.ones_like(features[..., 0])}
-
     def announce(self, photos: int, device: str) -> None:
         """Log the work ahead and the disk, memory and time it needs. Raises UserError if the disk is too
         small."""
-        (clip, dense), store, config, tasks = self.models(device), self._store, self._config, self._tasks
-        needed, crop_size = sum(task.bytes(clip, dense) for task in tasks), clip.crop_size if clip else 0
+        networks, store, config, tasks = self.networks(device), self._store, self._config, self._tasks
+        targets = [target for task in tasks for target in task.missing]
+        needed = _BYTES * sum(target.numbers(networks) for target in targets)
+        crop_size = networks.clip.crop_size if {CLIP, FINE} & self._kinds else 0
         store.make_folder()
         free = shutil.disk_usage(store.root).free
         if needed > free:
@@ -312,43 +225,40 @@ class _Maker:
         largest = max(task.photo.width * task.photo.height for task in tasks)
         memory = config.workers * 3 * 4 * (3 * largest + 12 * config.crop_batch * crop_size**2)
         split = f" in {config.workers} processes" if config.workers > 1 else ""
-        replaced = sum(any(store.path(k, t.photo.name).exists() for k in t.missing) for t in tasks)
+        replaced = sum(any(store.path(m.kind, t.photo.name).exists() for m in t.missing) for t in tasks)
         if replaced:
             say(
                 f"targets of {replaced} photos were made with other settings, or of other files, and are "
-                f"replaced: {spoken('--pipeline.datamanager.cache-dir')} keeps both"
+                f"replaced: {data_option('cache-dir')} keeps both"
             )
         say(
             f"preparing {len(tasks)} photos ({photos - len(tasks)} of {photos} are ready): "
             f"{_gigabytes(needed)} in {store.root}, {_gigabytes(free)} are free",
             f"memory beside the encoders: about {_gigabytes(memory)}{split}, however many photos there are",
         )
-        if clip:
-            self._announce_duration(clip, dense, torch.device(device))
+        if crop_size:
+            self._announce_duration(networks, torch.device(device), targets)
 
-    def _announce_duration(
-        self, clip: ImageTextEncoder, dense: DenseEncoder | None, device: torch.device
-    ) -> None:
+    def _announce_duration(self, networks: Networks, device: torch.device, targets: Sequence[Target]) -> None:
         """Log how many crops, or windows of a map, will be encoded, and an estimate of the duration, measured
         with noise."""
-        config, tasks = self._config, [task for task in self._tasks if task.clip]
-        encoded = [task.encoded(clip.crop_size // clip.patch_size) for task in tasks]
-        if sum(encoded) < _ANNOUNCED_CROPS:
+        config, clip = self._config, networks.clip
+        counts = [count for count in (target.pictures(networks) for target in targets) if any(count)]
+        encoded, fewest = (sum(numbers) for numbers in zip(*counts, strict=True))
+        if encoded < _ANNOUNCED_CROPS:
             return
         noise, rest = torch.rand(1, 3, clip.crop_size, clip.crop_size, device=device), 0.0
         of_crop = _seconds_each(lambda n: clip.encode_images(noise.expand(n, -1, -1, -1)), config.crop_batch)
-        if dense is not None:
-            of_photo = _seconds_each(lambda _: dense.encode(noise[0].permute(1, 2, 0)), 1)
-            rest = of_photo * sum(DENSE in task.missing for task in tasks)
-        least = (number if task.grids else task.fast for task, number in zip(tasks, encoded, strict=True))
-        takes, faster = ((n * of_crop + rest) / config.workers for n in (sum(encoded), sum(least)))
-        quality = spoken("--pipeline.datamanager.quality")
+        if mapped := sum(target.kind == DENSE for target in targets):
+            rest = mapped * _seconds_each(lambda _: networks.dense.encode(noise[0].permute(1, 2, 0)), 1)
+        takes, faster = ((n * of_crop + rest) / config.workers for n in (encoded, fewest))
+        quality = data_option("quality")
         hint = "" if faster > 0.9 * takes else f"; {quality} fast: {roughly(faster)}"
-        say(f"{len(tasks):,} photos, {sum(encoded):,} crops with {config.clip}: {roughly(takes)}{hint}")
+        say(f"{len(counts):,} photos, {encoded:,} crops with {config.clip}: {roughly(takes)}{hint}")
         if device.type == "cpu" and takes > _LONG_S:
             remedies = ["a GPU (some hundred times)", *([f"{quality} fast"] if hint else [])]
             if config.clip != BUILTIN:
-                remedies.append(f"{spoken(CLIP_OPTION)} builtin if its words suffice")
+                remedies.append(f"{data_option('clip')} builtin if its words suffice")
             say(
                 "That is long, since this runs on the CPU. What shortens it: "
                 f"{', '.join([*remedies, 'fewer photos'])}. It can be stopped at any time and goes on where "

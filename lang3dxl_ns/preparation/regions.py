@@ -16,6 +16,7 @@ from torch import Tensor
 from lang3dxl_ns.common.errors import UserError, readable
 from lang3dxl_ns.common.files import read_array
 from lang3dxl_ns.common.image import fitted_size, resize, resize_nearest
+from lang3dxl_ns.common.options import data_option
 from lang3dxl_ns.common.pictures import NoPictureError, open_picture
 from lang3dxl_ns.preparation.model_files import ModelFiles
 from lang3dxl_ns.preparation.segmentation import (
@@ -73,7 +74,8 @@ def region_source(config: PreparationConfig, data: Path) -> RegionSource | None:
         prompts = sorted(config.region_prompts)
         if not is_sam3(found):
             raise UserError(
-                f"regions text needs a SAM 3, and {found.words.name} is none: {TEXT_OPTION} facebook/sam3"
+                f"regions text needs a SAM 3, and {found.words.name} is none: "
+                f"{data_option(TEXT_OPTION)} facebook/sam3"
             )
         load = partial(_masks_of_instances, found.words, prompts)
         return MaskRegions(load, regions="text", prompts=prompts, model=found.identity)

@@ -16,6 +16,7 @@ from PIL import Image
 from torch import Tensor
 
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.options import data_option
 from lang3dxl_ns.preparation.model_files import (
     ModelFiles,
     find_model,
@@ -24,8 +25,8 @@ from lang3dxl_ns.preparation.model_files import (
     read_config,
 )
 
-TEXT_OPTION = "--pipeline.datamanager.foreground-model"
-SAM_OPTION = "--pipeline.datamanager.sam"
+TEXT_OPTION = "foreground-model"
+SAM_OPTION = "sam"
 
 SAM3_TYPES = ("sam3", "sam3_video")
 """Model types in SAM 3's configuration; published checkpoints contain the detector inside a video model."""
@@ -71,7 +72,7 @@ def find_text_segmenter(name_or_dir: str, sam: str) -> SegmenterFiles:
     kind = read_config(words).model_type
     if kind not in ("clipseg", "grounding-dino", *SAM3_TYPES):
         raise UserError(
-            f"{words.name} is a {kind} model: {TEXT_OPTION} takes a GroundingDINO "
+            f"{words.name} is a {kind} model: {data_option(TEXT_OPTION)} takes a GroundingDINO "
             "(IDEA-Research/grounding-dino-tiny), a CLIPSeg (CIDAS/clipseg-rd64-refined) or facebook/sam3"
         )
     return SegmenterFiles(words, find_sam(sam) if kind == "grounding-dino" else None)
@@ -82,7 +83,9 @@ def find_sam(name_or_dir: str) -> ModelFiles:
     files = find_model(name_or_dir, SAM_OPTION)
     kind = read_config(files).model_type
     if kind != "sam":
-        raise UserError(f"{files.name} is a {kind} model: {SAM_OPTION} takes a SAM: facebook/sam-vit-base")
+        raise UserError(
+            f"{files.name} is a {kind} model: {data_option(SAM_OPTION)} takes a SAM: facebook/sam-vit-base"
+        )
     return files
 
 

@@ -11,6 +11,7 @@ from typing import Literal
 
 from lang3dxl_ns.common.checks import check_numbers
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.options import data_option
 
 ClipFeatures = Literal["auto", "crops", "dense"]
 DistanceRule = Literal["median", "mean", "mean-inner"]
@@ -40,8 +41,8 @@ class PreparationConfig:
     """Number of crops. normal: at most 2,500 per photo for an encoder of 224 pixels (as many pixels for other
     encoders). fast: at most 700. fine: no bound, about 10,000 in a photo of 1,600 pixels."""
     clip: str = "auto"
-    """CLIP, SigLIP or another image-text encoder (docs/encoders.md) in Hugging Face format: a name, a folder,
-    or "builtin". auto: openai/clip-vit-base-patch32 if it was downloaded before, otherwise the built-in one.
+    """CLIP, SigLIP or another image-text encoder in Hugging Face format (docs/encoders.md): a name, a folder,
+    or builtin. auto: openai/clip-vit-base-patch32 if it was downloaded before, otherwise the built-in one.
     The paper uses the former, fine-tuned on landmarks."""
     clip_features: ClipFeatures = "auto"
     """How the image-text encoder reads photos. crops: one vector for each of thousands of crops. dense: a map
@@ -118,8 +119,8 @@ class PreparationConfig:
 
     def check(self) -> None:
         """Raise UserError for invalid options, before any work."""
-        check_numbers(self, _BOUNDS, "--pipeline.datamanager.")
-        option = "--pipeline.datamanager.scale-range"
+        check_numbers(self, _BOUNDS, data_option(""))
+        option = data_option("scale-range")
         if self.scale_range is None:
             return
         smallest, largest = self.scale_range

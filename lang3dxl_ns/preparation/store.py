@@ -20,6 +20,7 @@ from torch import Tensor
 from lang3dxl_ns.common.console import say, tracked
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import read_json, replace_file
+from lang3dxl_ns.common.options import data_option
 from lang3dxl_ns.scene.photo import Photo
 
 logger = logging.getLogger(__name__)
@@ -89,7 +90,7 @@ class FeatureStore:
                 ) from error
             raise UserError(
                 f"{self.root} can't be written to ({error.strerror or error}): keep the targets elsewhere "
-                "with --pipeline.datamanager.cache-dir DIR"
+                f"with {data_option('cache-dir')} DIR"
             ) from error
 
     def read(self, kind: str, name: str, settings: dict[str, Any] | None = None) -> dict[str, Tensor]:
@@ -101,8 +102,7 @@ class FeatureStore:
             if settings is not None and file.metadata()["settings"] != _canonical(settings):
                 raise PhotosGoneError(
                     f"{path} was meanwhile made with other settings, by another command: repeat this one (a "
-                    "run goes on with --load-dir), and give the other a --pipeline.datamanager.cache-dir of "
-                    "its own"
+                    "run goes on with --load-dir), and give the other a {data_option('cache-dir')} of its own"
                 )
             return {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 (not a dict)
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -38,9 +38,10 @@ class Meaning:
         ]
 
 
-def phrases_of(typed: str) -> list[tuple[str, list[str]]]:
+def phrases_of(typed: str, names: Iterable[str] = ()) -> list[tuple[str, list[str]]]:
     """Split what was typed into prompts, each with its negatives. `;`, commas and *and* separate prompts,
-    *not* begins negatives, and quotes protect what they hold. An empty prompt has negatives alone."""
+    *not* begins negatives, and quotes protect what they hold, as do `names`, such as *lords and ladies*. An
+    empty prompt has negatives alone."""
     held: list[str] = []
 
     def hold(found: re.Match[str]) -> str:
@@ -48,7 +49,7 @@ def phrases_of(typed: str) -> list[tuple[str, list[str]]]:
         return f"{_HELD}{len(held) - 1}{_HELD}"
 
     text = re.sub(r'"[^"]*"', hold, typed)
-    text = _pattern("one").sub(hold, text)
+    text = _words((*TABLE["one"], *names)).sub(hold, text)
     shown = [
         (_restored(prompt, held), [_restored(phrase, held) for phrase in negatives])
         for part in text.split(";")
@@ -79,7 +80,11 @@ def _restored(text: str, held: Sequence[str]) -> str:
 @cache
 def _pattern(kind: str) -> re.Pattern[str]:
     """Match any of the table's phrases of a kind as whole words."""
-    words = "|".join(re.escape(word) for word in sorted(TABLE[kind], key=len, reverse=True))
+    return _words(TABLE[kind])
+
+
+def _words(phrases: Iterable[str]) -> re.Pattern[str]:
+    words = "|".join(re.escape(phrase) for phrase in sorted(phrases, key=len, reverse=True))
     return re.compile(rf"(?<!\w)(?:{words})(?!\w)", re.IGNORECASE)
 
 

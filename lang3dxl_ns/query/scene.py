@@ -510,13 +510,13 @@ class Scene:
     def prompts(self, texts: Text | Sequence[Text]) -> list[Prompt]:
         """Parse prompts, and attach the taught words. Raises UserError if there are no prompts."""
         prompts = list[Prompt]()
+        if isinstance(texts, Array) and texts.dtype.kind in "OU":
+            texts = texts.ravel().tolist()
         listed: Sequence[Any] = texts if isinstance(texts, list | tuple) else [texts]
         for text in listed:
             if isinstance(text, Tensor | Array):
                 text = Prompt("vector", vector=self._vector(text))
-            if isinstance(text, str) and known_word(text) in self.words:
-                text = Prompt(" ".join(text.split()))
-            for prompt in [text] if isinstance(text, Prompt) else parse_prompts(text):
+            for prompt in [text] if isinstance(text, Prompt) else parse_prompts(text, self.words):
                 word = None if prompt.vector is not None else self.words.get(known_word(prompt.text))
                 prompts.append(prompt if word is None else replace(prompt, taught=word))
         return prompts or parse_prompts("")

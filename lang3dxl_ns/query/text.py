@@ -68,13 +68,14 @@ def taught_prompt(word: str) -> Prompt:
     return prompt
 
 
-def parse_prompts(typed: str) -> list[Prompt]:
+def parse_prompts(typed: str, names: Iterable[str] = ()) -> list[Prompt]:
     """Parse prompts as people type them: `windows and doors`, `windows, doors; dome`, `windows not doors`.
-    Quotes protect a phrase. The grammar is in `query/language.py`. Raises UserError if there is no prompt."""
+    Quotes protect a phrase, and `names` are never split. The grammar is in `query/language.py`. Raises
+    UserError if there is no prompt."""
     (clean,) = texts_of([typed], "a prompt")
     clean = _SINGLE_QUOTES.sub(r'"\1"', clean.translate(_CURLY_QUOTES)).replace("\0", " ")
     # Single spaces, since runs of them would take patterns a time that grows with their square.
-    found = phrases_of(" ".join(clean.split()))
+    found = phrases_of(" ".join(clean.split()), names)
     if not found:
         raise UserError("the prompt is empty: type what to look for, such as rose window")
     if alone := [negatives for text, negatives in found if not text]:

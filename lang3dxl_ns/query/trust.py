@@ -33,8 +33,8 @@ CLEARLY = 0.8
 28 of 29 right words are without a caution, and 281 of 281 wrong or absent ones have one. The thresholds were
 chosen on the same scenes."""
 STRICTER, STRICTEST = 0.15, 0.99
-"""How much more a scene unlike what the CLIP was trained on has to reach, per unit of foreignness beyond 1,
-and the most that is asked for."""
+"""How much more a scene unlike what the CLIP was trained on has to reach, per unit of foreignness beyond
+`FAR`, and the most that is asked for."""
 FAR = 1.4
 """Foreignness from which a scene is unlike what the CLIP was trained on. Six validation landmarks have
 0.9 to 1.2, the castle 2.0."""
@@ -44,7 +44,7 @@ _TYPICAL = 5.3
 """Median distance of scenes of generated landmarks, so that their foreignness is about 1."""
 _SAMPLE = 4096
 _TEACH = "outline it in a photo (lang3dxl teach)"
-_LARGER = "train with a larger CLIP (--pipeline.datamanager.clip openai/clip-vit-base-patch32)"
+_LARGER = "train with a larger CLIP (--clip openai/clip-vit-base-patch32)"
 
 
 @dataclass(frozen=True)
@@ -107,7 +107,7 @@ def least_peak(foreign: float | None) -> float:
     """Compute the peak from which an answer is sure, by the foreignness of the scene."""
     if foreign is None or foreign < FAR:
         return CLEARLY
-    return min(CLEARLY + STRICTER * (foreign - 1), STRICTEST)
+    return min(CLEARLY + STRICTER * (foreign - FAR), STRICTEST)
 
 
 def alike(

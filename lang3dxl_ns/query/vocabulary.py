@@ -21,8 +21,9 @@ from lang3dxl_ns.words.taught_words import known_word
 
 def same_thing(word: str, texts: Sequence[str]) -> bool:
     """Return whether one of the texts is this word, singular or plural, or a synonym of it."""
-    forms = {form for text in texts for form in singulars(searched(text).lower())}
-    return word in forms or bool(forms & alternatives(word)) or word in synonyms_of(texts[0])
+    meant, known = [searched(text).lower() for text in texts], {word, *alternatives(word)}
+    alike = [all(known & {*singulars(part)} for part in text.split()) for text in meant]  # glass windows
+    return any(alike) or any(known & {*singulars(text)} for text in meant) or word in synonyms_of(texts[0])
 
 
 @cache

@@ -25,17 +25,21 @@ from lang3dxl_ns.scene.camera import camera_to_world
 from lang3dxl_ns.scene.colmap import Reconstruction, TrackedPhoto, photos_in_model, read_reconstruction
 from lang3dxl_ns.scene.companions import inside
 from lang3dxl_ns.scene.frame import COLMAP_UP, Center, Frame, Orientation, find_frame, lost_cameras
+from lang3dxl_ns.scene.layout import (
+    MODEL_FOLDERS,
+    find_model,
+    has_model,
+    images_folder,
+    mention_other_cameras,
+    whole_scene,
+)
 from lang3dxl_ns.scene.masks import mask_folder
 from lang3dxl_ns.scene.names import resolve
 from lang3dxl_ns.scene.photo import Photo, upright_in_model
 from lang3dxl_ns.scene.photo_folder import extract_frames, find_photos, frames_folder, is_video, photos_below
 from lang3dxl_ns.scene.reconstruct import reconstruct_scene, shows_these
-from lang3dxl_ns.scene.transforms import TRANSFORMS, Transforms, read_transforms
+from lang3dxl_ns.scene.transforms import SPLITS, TRANSFORMS, Transforms, read_transforms
 
-_MODEL_FOLDERS = (
-    *(Path("sparse/0"), Path("sparse"), Path("colmap/sparse/0"), Path("colmap/sparse"), Path("dense/sparse")),
-    *(Path("colmap"), Path(".")),
-)
 _OWN_MODEL = Path("lang3dxl_cache/reconstruction/sparse/0")
 """Folder of a model that is reconstructed here, if sparse/ is taken."""
 _SPLIT_LISTS = ("train_list.txt", "validation_list.txt", "val_list.txt", "test_list.txt")
@@ -99,6 +103,10 @@ class Capture:
     settings: CaptureSettings = field(default_factory=CaptureSettings)
     transforms: Transforms | None = None
     """Contents of the transforms.json, if it comes from one."""
+    known_split: Split | None = None
+    """The split, if another program chose it."""
+    known_frame: Frame | None = None
+    """Similarity to training's coordinates, if it is that of another capture or program."""
 
     @property
     def names(self) -> list[str]:
@@ -109,6 +117,8 @@ class Capture:
     def split(self) -> Split:
         """Photos to train on and photos held out, as lists in the folder say, or by the settings' rule.
         Raises UserError if one of the two is empty, or a list names an unknown photo."""
+        if self.known_split is not None:
+            return self.known_split
         train, held_out = self._listed_split() or self._split_by_rule()
         for part, names in (("train", train), ("held-out", held_out)):
             if not names:
@@ -182,6 +192,8 @@ class Capture:
     @cached_property
     def frame(self) -> Frame:
         """Similarity from the file's coordinates to training's."""
+        if self.known_frame is not None:
+            return self.known_frame
         settings = self.settings
         return find_frame(
             self._world_from_camera(self.names), self.reconstruction.points,
@@ -264,27 +276,33 @@ def find_source(
         raise UserError(f"{folder} is not a folder: pass the one that holds your photos as --data")
     if settings.colmap_path is not None:
         return folder, folder / settings.colmap_path
-    places = [*_MODEL_FOLDERS, _OWN_MODEL]
+    if (whole := whole_scene(folder)) != folder:
+        say(f"{folder} is a part of the scene {whole}, which is read")
+        folder, source = whole, folder
+        return folder, source if has_model(source) else find_model(folder) or source
     work = None if cache_dir is None else expanded(cache_dir).absolute() / "reconstruction"
+    own = [folder / _OWN_MODEL]
     if work is not None and shows_these(work, folder):
-        places.append(work / "sparse/0")
-    for place in places:
-        if any((folder / place / f"images{ending}").exists() for ending in (".bin", ".txt")):
-            return folder, folder / place
-    if (folder / TRANSFORMS).exists():
-        return folder, folder / TRANSFORMS
+        own.append(work / "sparse/0")
+    for model in (find_model(folder), *filter(has_model, own)):
+        if model is not None:
+            return folder, model
+    for name in (TRANSFORMS, SPLITS[0]):
+        if (folder / name).exists():
+            return folder, folder / name
     if may_reconstruct and find_photos(folder).names:
+        mention_other_cameras(folder)
         return reconstruct_scene(folder, cache_dir)
     if may_reconstruct and not any(folder.iterdir()):
         raise UserError(f"{folder} is empty: give the folder with your photos")
-    return folder, folder / _MODEL_FOLDERS[0]  # reading it tells what is missing
+    return folder, folder / MODEL_FOLDERS[0]  # reading it tells what is missing
 
 
 # ── from a COLMAP model ─────────────────────────────────────────────────────────────────────────────────
 
 
 def _of_model(folder: Path, model: Path, settings: CaptureSettings) -> Capture:
-    found, images = read_reconstruction(model), folder / images_path(folder, settings.images_path)
+    found, images = read_reconstruction(model), images_folder(folder, model, settings.images_path)
     links = settings.follow_links
     exists = lambda name: _exists(images, name)  # noqa: E731
     files, doubts = resolve(list(found.photos), exists, lambda: photos_below(images), "photos")
@@ -303,14 +321,6 @@ def _exists(folder: Path, name: str) -> bool:
     return path.is_symlink() or path.exists()
 
 
-def images_path(data: Path, named: Path = Path("images")) -> Path:
-    """Return the photos' folder relative to the scene's: `named` if it has photos, else one that has."""
-    if (data / named).is_dir() and any(photos_below(data / named)):
-        return named
-    found = find_photos(data)
-    return found.folder.relative_to(data) if found.names else named
-
-
 def _usable(
     folder: Path,
     images: Path,
@@ -322,7 +332,7 @@ def _usable(
     masks_of: dict[str, Path] | None = None,
 ) -> Capture:
     """Match cameras with files on disk, by the names in `files`. Photos that can't be used are left out."""
-    masks = mask_folder(folder, settings.masks_path, links)
+    masks = mask_folder(folder, settings.masks_path, links, images)
     photos, left_out, kept = list[Photo](), dict[str, str](), dict[str, TrackedPhoto]()
     for name, tracked in found.photos.items():
         file = files[name]

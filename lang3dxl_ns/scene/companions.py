@@ -8,6 +8,7 @@ from pathlib import Path, PurePosixPath
 
 from lang3dxl_ns.common.errors import UserError, is_plain
 from lang3dxl_ns.common.files import expanded
+from lang3dxl_ns.common.options import data_option
 
 _LONGEST_NAME = 255
 """Longest file name that file systems allow, in bytes."""
@@ -58,7 +59,19 @@ def named_folder(choice: str, data: Path, option: str) -> Path:
     folder = data / expanded(choice)
     if not folder.is_dir():
         raise UserError(
-            f"--pipeline.datamanager.{option} {choice}: there is no folder {folder}; give an existing one "
+            f"{data_option(option)} {choice}: there is no folder {folder}; give an existing one "
             "(relative to the data folder, or absolute), or one of the choices listed by --help"
         )
+    return folder
+
+
+def cache_folder(data: Path, named: Path | None) -> Path:
+    """Return the folder of prepared targets: the named one, or lang3dxl_cache in the photos' folder. Raises
+    UserError if the latter is a link: who made that folder would choose which files are written over."""
+    if named is not None:
+        return expanded(named)
+    folder = data / "lang3dxl_cache"
+    if folder.is_symlink():
+        instead = f"{data_option('cache-dir')} {os.path.realpath(folder)}"
+        raise UserError(f"{folder} is a link: remove it, or if it is yours, add {instead}")
     return folder

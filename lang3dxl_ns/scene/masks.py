@@ -12,6 +12,7 @@ from lang3dxl_ns.scene.companions import inside
 from lang3dxl_ns.scene.names import normal_parts
 
 FOLDERS = (Path("masks"), Path("mask"))
+"""Usual folders, with any capitals, and with a dot or a line before them."""
 _MARKS = ("_mask", "-mask", ".mask", " mask", "_seg")
 """What programs append to a photo's name."""
 _Key = tuple[str, ...]
@@ -21,11 +22,12 @@ class MaskFolder:
     """Masks of a folder, a picture of any format for each photo.
 
     The mask of photo.jpg is photo.jpg.png or photo.png, in any picture format, with or without a word like
-    `_mask` before or after an ending, in the same sub-folder as the photo or in none.
+    `_mask` before or after an ending, in the same sub-folder as the photo or in none. In a folder that holds
+    the photos as well (`beside`), a mask has such a word.
     """
 
-    def __init__(self, folder: Path, follow_links: bool = False) -> None:
-        self.folder, self._follow_links = folder, follow_links
+    def __init__(self, folder: Path, follow_links: bool = False, beside: bool = False) -> None:
+        self.folder, self._follow_links, self._beside = folder, follow_links, beside
 
     def find(self, photo: str) -> Path | None:
         """Find a photo's mask. Raises UserError for a photo's name that leads out of the folder, for a mask
@@ -58,7 +60,7 @@ class MaskFolder:
             for file in files:
                 name = Path(parent, file).relative_to(self.folder).as_posix()
                 *folders, last = normal_parts(name)
-                for form in _forms(last):
+                for form in photos_of_mask(last) if self._beside else _forms(last):
                     found.setdefault((*folders, form), []).append(name)
         return found
 
@@ -76,18 +78,32 @@ def _forms(last: str) -> list[str]:
     return [*forms, *(form.removeprefix("mask_") for form in forms if form.startswith("mask_"))]
 
 
+def photos_of_mask(last: str) -> list[str]:
+    """List the names that the photo of a mask beside it may have; none for a name without a mask's word."""
+    return _forms(last)[1:]
+
+
 def _rank(file: str) -> int:
     """Order masks of one photo: lossless pictures first."""
     lower = file.lower()
     return next((i for i, end in enumerate((".png", ".jpg", ".jpeg")) if lower.endswith(end)), 3)
 
 
-def mask_folder(data: Path, named: Path | None, follow_links: bool = False) -> MaskFolder | None:
-    """Return the folder of masks: `named` (relative to `data`), or where that is the usual one and does not
-    exist, another usual one; None if there is none."""
-    folders = FOLDERS if named in FOLDERS else (named,)
-    found = (data / folder for folder in folders if folder is not None)
-    return next((MaskFolder(folder, follow_links) for folder in found if folder.is_dir()), None)
+def mask_folder(
+    data: Path, named: Path | None, follow_links: bool = False, images: Path | None = None
+) -> MaskFolder | None:
+    """Return the folder of masks: `named` (relative to `data`), or where that is the usual one, a usual one
+    of the scene or of the photos (`images`), or the photos' folder if masks lie in it; None if there is
+    none."""
+    if named not in FOLDERS:
+        return MaskFolder(data / named, follow_links) if named and (data / named).is_dir() else None
+    images = images or data
+    for folder in dict.fromkeys((data, images.parent, images)):
+        for path in sorted(folder.iterdir()) if folder.is_dir() else []:
+            if Path(path.name.casefold().lstrip("._")) in FOLDERS and path.is_dir():
+                return MaskFolder(path, follow_links)
+    beside = MaskFolder(images, follow_links, beside=True)
+    return beside if beside.count else None
 
 
 def find_mask(folder: Path, name: str, follow_links: bool = False) -> Path | None:

@@ -30,12 +30,14 @@ from lang3dxl_ns.common.pictures import (
     open_picture,
     unreadable,
 )
+from lang3dxl_ns.scene.masks import photos_of_mask
 
 IMAGE_FOLDERS = (Path("images"), Path("dense/images"))
 _NOT_PHOTOS = {
     *("masks", "mask", "segments", "depth", "depths", "normals", "ground_truth", "labels", "sparse", "dense"),
     *("lang3dxl_cache", "outputs", "renders", "colmap", "images_2", "images_4", "images_8"),
 }
+_KNOWN = (*PHOTO_SUFFIXES, *RAW_SUFFIXES, *OTHER_SUFFIXES)
 _OWN = re.compile(r"\.[0-9a-f]{16}\.(png|jpg)$")
 """Ends of the names of pictures in a feature store, which --cache-dir may put into the photos' folder."""
 
@@ -92,17 +94,22 @@ def readable(photos: PhotoFolder) -> tuple[PhotoFolder, dict[str, str]]:
 
 
 def photos_below(folder: Path) -> list[str]:
-    """List the photos in a folder and its sub-folders, without masks, results and the like, sorted."""
+    """List the photos in a folder and its sub-folders, sorted, without results and the like, and without
+    masks, in folders of their own or beside their photos."""
     names = []
     for parent, folders, files in os.walk(folder):
         folders[:] = [f for f in folders if f.lower() not in _NOT_PHOTOS and not f.startswith((".", "_"))]
         if Path(parent).name == "reconstruction":
             folders[:] = [f for f in folders if f != "numbered"]
-        for file in files:
-            path = Path(parent, file)
-            known = (*PHOTO_SUFFIXES, *RAW_SUFFIXES, *OTHER_SUFFIXES)
-            if path.suffix.lower() in known and not file.startswith(".") and not _OWN.search(file):
-                names.append(path.relative_to(folder).as_posix())
+        pictures = [
+            file
+            for file in files
+            if Path(file).suffix.lower() in _KNOWN and not file.startswith(".") and not _OWN.search(file)
+        ]
+        lower = {name for file in pictures for name in (file.casefold(), Path(file).stem.casefold())}
+        for file in pictures:
+            if lower.isdisjoint(photos_of_mask(file.casefold())):
+                names.append(Path(parent, file).relative_to(folder).as_posix())
     return sorted(names)
 
 

@@ -68,10 +68,10 @@ def doubtful_placements(
     return reasons | dict.fromkeys(lonely, "only one other photo supports it")
 
 
-def matched_pairs(database: pycolmap.Database, model: pycolmap.Reconstruction) -> list[MatchedPair]:
-    """List the verified pairs among a model's photos, except those without depth or with few matches."""
+def matched_pairs(database: pycolmap.Database, cameras: Mapping[int, pycolmap.Camera]) -> list[MatchedPair]:
+    """List the verified pairs among photos with these cameras (by the photos' numbers), except those without
+    depth or with few matches."""
     pycolmap = load_pycolmap()
-    cameras = {i: model.cameras[image.camera_id] for i, image in model.images.items() if image.has_pose}
     points = {number: database.read_keypoints(number)[:, :2].astype(float) for number in cameras}
     found = []
     for key, matches in zip(*database.read_two_view_geometry_num_inliers(), strict=True):
@@ -86,6 +86,11 @@ def matched_pairs(database: pycolmap.Database, model: pycolmap.Reconstruction) -
             turn = geometry.cam2_from_cam1.rotation.matrix()
             found.append(MatchedPair(first, second, int(matches), turn))
     return found
+
+
+def cameras_of(model: pycolmap.Reconstruction) -> dict[int, pycolmap.Camera]:
+    """Return the cameras of a model's photos with a pose, by the photos' numbers."""
+    return {i: model.cameras[image.camera_id] for i, image in model.images.items() if image.has_pose}
 
 
 def rotations_of(model: pycolmap.Reconstruction) -> dict[int, Float[Array, "3 3"]]:

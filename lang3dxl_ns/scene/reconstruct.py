@@ -28,6 +28,7 @@ from lang3dxl_ns.common.memory import machine_memory
 from lang3dxl_ns.common.pictures import open_picture
 from lang3dxl_ns.common.reports import measure, part
 from lang3dxl_ns.scene.colmap import load_pycolmap
+from lang3dxl_ns.scene.companions import cache_folder
 from lang3dxl_ns.scene.learned_features import extract_learned, features_for, match_learned
 from lang3dxl_ns.scene.pairing import pairs_to_match
 from lang3dxl_ns.scene.photo_folder import (
@@ -38,8 +39,15 @@ from lang3dxl_ns.scene.photo_folder import (
     readable,
     shared_cameras,
 )
-from lang3dxl_ns.scene.placements import LEAST_MATCHES, doubtful_placements, matched_pairs, rotations_of
-from lang3dxl_ns.scene.reconstruction import ReconstructionReport, ReconstructionSettings
+from lang3dxl_ns.scene.placements import (
+    LEAST_MATCHES,
+    cameras_of,
+    doubtful_placements,
+    matched_pairs,
+    rotations_of,
+)
+from lang3dxl_ns.scene.reconstruction import REPORT, ReconstructionReport, ReconstructionSettings
+from lang3dxl_ns.scene.symmetry import without_contradictions
 
 if TYPE_CHECKING:
     import pycolmap
@@ -75,15 +83,17 @@ def reconstruct(
             _extract(database, copies, settings)
         with part("matching"):
             _match(database, copies.names, settings)
-        with part("mapping"):
-            models = _map(database, copies, work, settings.mapper)
+        with part("mapping"), TemporaryDirectory(dir=work) as folder:
+            consistent = Path(folder) / "database.db"
+            contradicting = without_contradictions(database, consistent)
+            models = _map(consistent, copies, work, settings.mapper)
     features, partners = _features_and_partners(database)
     if not models:
         raise UserError(_why_no_model(features, partners))
     best, names = models[0], dict(zip(copies.names, good.names, strict=True))
     reasons = _reasons(copies.names, models, features, partners)
     with load_pycolmap().Database.open(database) as db:
-        doubts = doubtful_placements(rotations_of(best), matched_pairs(db, best))
+        doubts = doubtful_placements(rotations_of(best), matched_pairs(db, cameras_of(best)))
     doubtful = {names[best.images[i].name]: why for i, why in sorted(doubts.items())}
     for image in (image for model in models for image in model.images.values()):
         image.name = names[image.name]
@@ -91,13 +101,13 @@ def reconstruct(
         photos=len(photos.names), registered=best.num_reg_images(), points=best.num_points3D(),
         error=float(best.compute_mean_reprojection_error()),
         cameras=len({image.camera_id for image in best.images.values() if image.has_pose}),
-        mapper=settings.mapper, doubtful=doubtful,
+        mapper=settings.mapper, contradicting=contradicting, doubtful=doubtful,
         left_out=left_out | {names[number]: why for number, why in reasons.items()},
         other_models=tuple(other.num_reg_images() for other in models[1:]),
         seconds={stage: round(sum(spent), 1) for stage, spent in clock.items()},
     )  # fmt: skip
     _publish(models, model)
-    replace_file(work / "report.json", json.dumps(asdict(report), indent=2))
+    replace_file(work / REPORT.name, json.dumps(asdict(report), indent=2))
     return report
 
 
@@ -111,7 +121,7 @@ def reconstruct_scene(
     if is_video(data):
         data = extract_frames(data)
     photos = find_photos(data)
-    work = expanded(cache_dir or data / "lang3dxl_cache").absolute() / "reconstruction"
+    work = cache_folder(data, cache_dir).absolute() / REPORT.parent
     model = data / "sparse"
     if not os.access(data, os.W_OK) or (model.exists() and not model_in(model)):
         model = work / "sparse"
@@ -206,7 +216,12 @@ def _database(photos: PhotoFolder, copies: PhotoFolder, work: Path, settings: Re
     database, stamped = work / "database.db", work / _STAMP
     if database.is_file() and stamped.is_file() and stamped.read_text() == stamp:
         return database
-    for old in (stamped, *work.glob("database.db*"), *work.glob("importing.db*"), *work.glob("xfeat/*")):
+    for old in (
+        stamped,
+        *work.glob("database.db*"),
+        *work.glob("importing.db*"),
+        *work.glob("xfeat/*"),
+    ):
         old.unlink(missing_ok=True)
     importing = work / "importing.db"
     pycolmap.Database.open(importing).close()

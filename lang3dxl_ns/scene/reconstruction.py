@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Literal
 
 from lang3dxl_ns.common.console import some
+from lang3dxl_ns.common.errors import DAMAGE
+from lang3dxl_ns.common.files import read_json
+
+REPORT = Path("reconstruction/report.json")
+"""File of the report in a scene's cache."""
 
 
 @dataclass
@@ -37,6 +44,8 @@ class ReconstructionReport:
     """Mean reprojection error in pixels."""
     cameras: int
     mapper: str
+    contradicting: int = 0
+    """Pairs of photos that match, but contradict others and were left out."""
     left_out: dict[str, str] = field(default_factory=dict)
     """Photos without a pose, with reasons."""
     doubtful: dict[str, str] = field(default_factory=dict)
@@ -60,6 +69,11 @@ class ReconstructionReport:
                 f"largest, of {self.registered}, is used; the others have {sizes}. Add photos that connect "
                 "them, or give each group its own folder"
             )
+        if self.contradicting:
+            found.append(
+                f"{self.contradicting} pairs of photos match but contradict others, as different sides that "
+                "look alike do: they were left out"
+            )
         for what, photos in (("doubtfully placed", self.doubtful), ("left out", self.left_out)):
             reasons: dict[str, list[str]] = {}
             for name, why in photos.items():
@@ -71,3 +85,10 @@ class ReconstructionReport:
                 "doubtful ones in the viewer, and remove those that stand wrong"
             )
         return found
+
+
+def doubtful_photos(cache_dir: Path) -> dict[str, str]:
+    """Read from a scene's cache which photos were doubtfully placed, with reasons; none without a report."""
+    with suppress(*DAMAGE):
+        return {str(name): str(why) for name, why in read_json(cache_dir / REPORT)["doubtful"].items()}
+    return {}

@@ -59,18 +59,25 @@ class ScenePhoto:
     """Clockwise quarter turns that bring the file's pixels as stored upright."""
     file: tuple[int, int] | None = None
     """Width and height of the file, upright; None: as read."""
+    doubtful: str | None = None
+    """Reason why the pose may be wrong."""
 
     @classmethod
     def of(
-        cls, photo: Photo, split: Literal["train", "eval"], camera_to_world: list[list[float]], scale: float
+        cls,
+        photo: Photo,
+        split: Literal["train", "eval"],
+        camera_to_world: list[list[float]],
+        scale: float,
+        doubtful: str | None = None,
     ) -> ScenePhoto:
-        """Describe a photo that is used at `scale` and seen from a pose."""
+        """Describe a photo that is used at `scale` and seen from a pose, which may be doubtful."""
         mask = None if photo.mask_path is None else str(photo.mask_path.absolute())
         size = photo.width, photo.height
         lens, turns, file = photo.lens.scaled(scale), photo.quarter_turns, None
         with suppress(UserError):  # the photo is gone or damaged
             file = photo.file_size()
-        return cls(photo.name, split, camera_to_world, lens, mask, size, turns, file)
+        return cls(photo.name, split, camera_to_world, lens, mask, size, turns, file, doubtful)
 
     def __repr__(self) -> str:
         width, height = self.file_size
@@ -214,7 +221,8 @@ def _photo(lens: dict[str, Any], size: Any = None, file: Any = None, **rest: Any
     photo = ScenePhoto(lens=Lens(**lens), size=size, file=file, **rest)
     expect(is_name(photo.name), f"a photo is called {photo.name!r}")
     expect(photo.split in ("train", "eval"), f"{photo.name} is in the split {photo.split!r}")
-    expect(isinstance(photo.mask, str | None), f"{photo.name} has the mask {photo.mask!r}")
+    for text in (photo.mask, photo.doubtful):
+        expect(isinstance(text, str | None), f"{photo.name} has {text!r} for a mask or a reason")
     expect(photo.quarter_turns in range(4), f"{photo.name} is turned {photo.quarter_turns!r} quarters")
     expect(len(photo.camera_to_world) == 3, f"{photo.name} has no pose")
     check_pose(photo.camera_to_world)

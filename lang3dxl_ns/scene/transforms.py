@@ -27,6 +27,8 @@ from lang3dxl_ns.scene.photo_folder import files_below, photos_below
 from lang3dxl_ns.scene.ply_points import read_ply_points
 
 TRANSFORMS = "transforms.json"
+SPLITS = ("transforms_train.json", "transforms_val.json", "transforms_test.json")
+"""Files of Blender's scenes, one for each part of the split."""
 _MOST_BYTES = 1 << 30
 _PERSPECTIVE = {
     **dict.fromkeys(("OPENCV", "PERSPECTIVE"), ("k1", "k2", "p1", "p2", "k3")),
@@ -62,16 +64,12 @@ class Transforms:
 
 
 def read_transforms(path: Path) -> Transforms:
-    """Read a transforms.json with its points. Photos, masks and points lie in its folder. Raises UserError if
-    the file is damaged, lists no photo, or names points outside its folder."""
+    """Read a transforms.json with its points. Photos, masks and points lie in its folder. The files of a
+    split are read together. Raises UserError if the file is damaged, lists no photo, or names points outside
+    its folder."""
     with readable(f"{path} can't be used", "correct it, or make it again"):
-        content = read_json(path, _MOST_BYTES)
-        frames: Any = content.get("frames") if isinstance(content, dict) else None
-        expect(isinstance(frames, list) and bool(frames), "it lists no photo under frames")
-        expect(
-            all(isinstance(frame, dict) for frame in frames), "a photo is not described by names and values"
-        )
-        expect(all("file_path" in frame for frame in frames), "a photo has no file_path")
+        content = _content(path)
+        frames = content["frames"]
         applied, scale = content.get("applied_transform"), content.get("applied_scale", 1.0)
         if applied is not None:
             check_pose(applied)
@@ -85,6 +83,28 @@ def read_transforms(path: Path) -> Transforms:
         *found, points, colors, train, frozenset[str]().union(*held_out) if held_out else None,
         None if applied is None else np.array(applied, np.float64)[:3], float(scale),
     )  # fmt: skip
+
+
+def _content(path: Path) -> dict[str, Any]:
+    """Read the file, or the files of a split as one that lists its parts."""
+    if path.name != SPLITS[0]:
+        return _file(path)
+    beside = {key: path.with_name(name) for key, name in zip(_LISTS, SPLITS, strict=True)}
+    parts = {key: _file(part) for key, part in beside.items() if part.exists()}
+    lists = {key: [frame["file_path"] for frame in part["frames"]] for key, part in parts.items()}
+    frames = [{**part, **frame} for part in parts.values() for frame in part["frames"]]
+    return _file(path) | lists | {"frames": frames}
+
+
+def _file(path: Path) -> dict[str, Any]:
+    """Read a file and check that it lists photos. Values of null are left out."""
+    content: Any = read_json(path, _MOST_BYTES)
+    frames: Any = content.get("frames") if isinstance(content, dict) else None
+    expect(isinstance(frames, list) and bool(frames), "it lists no photo under frames")
+    expect(all(isinstance(frame, dict) for frame in frames), "a photo is not described by names and values")
+    frames = [{key: value for key, value in frame.items() if value is not None} for frame in frames]
+    expect(all("file_path" in frame for frame in frames), "a photo has no file_path")
+    return {key: value for key, value in content.items() if value is not None} | {"frames": frames}
 
 
 _Found = tuple[dict[str, TrackedPhoto], dict[str, Path], dict[str, UserError]]

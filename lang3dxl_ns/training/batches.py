@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import random
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
@@ -17,20 +17,22 @@ from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.device import to_device
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.memory import machine_memory
+from lang3dxl_ns.common.options import data_option
 from lang3dxl_ns.preparation.encoders import usual_dense
-from lang3dxl_ns.preparation.foreground import with_foreground
+from lang3dxl_ns.preparation.foreground import foreground_kind, with_foreground
 from lang3dxl_ns.preparation.model_files import CLIP_OPTION, find_model, usual_clip
 from lang3dxl_ns.preparation.needs import Need, scene_needs
 from lang3dxl_ns.preparation.photo_cache import PhotoCache, has_vanished
-from lang3dxl_ns.preparation.physical_scale import plan_crops
+from lang3dxl_ns.preparation.physical_scale import CropPlan, plan_crops
 from lang3dxl_ns.preparation.prepare import prepare
-from lang3dxl_ns.preparation.regions import region_source
+from lang3dxl_ns.preparation.regions import RegionSource, region_source
 from lang3dxl_ns.preparation.settings import PreparationConfig
 from lang3dxl_ns.preparation.store import FeatureStore, PhotosGoneError
-from lang3dxl_ns.preparation.targets import Batch, SceneFacts, TargetReader
-from lang3dxl_ns.preparation.working_photos import WorkingPhotos
+from lang3dxl_ns.preparation.targets import CLIP, DENSE, FINE, REGIONS, Batch, SceneFacts, TargetReader
+from lang3dxl_ns.preparation.working_photos import PHOTO_MASKS, PHOTOS, WorkingPhotos
 from lang3dxl_ns.scene.capture import Capture
 from lang3dxl_ns.scene.photo import Photo
+from lang3dxl_ns.scene.reconstruction import doubtful_photos
 from lang3dxl_ns.scene.record import ScenePhoto, SceneRecord
 from lang3dxl_ns.training.state import PhotoCamera
 
@@ -38,8 +40,6 @@ IN_A_STEP = {"clip_target": torch.float32, "dense_target": torch.float32, "regio
 """Number types of targets in a step; in memory they are kept half as wide."""
 MOST_GONE = 0.1
 """Share of the training photos that may vanish before training ends."""
-ORDER_SEED = 42
-"""Seed of the order of photos."""
 
 
 def settle(config: PreparationConfig, learned: bool, gathered: bool) -> None:
@@ -63,21 +63,18 @@ def read_data(
     data: dict[str, Any] = {"image": working.read(photo, scale)}
     if (mask := working.mask(photo, scale)) is not None:
         data["mask"] = mask[..., None]
-    return data if targets is None else data | read_targets(photo.name, targets)
-
-
-def read_targets(name: str, targets: TargetReader) -> dict[str, Any]:
-    """Read a photo's targets from disk; see `read_data`."""
-    clip = targets.clip(name)
-    found = {"clip_target": clip.features, "dense_target": targets.dense(name)}
-    found["regions"] = targets.regions(name)
+    if targets is None:
+        return data
+    clip = targets.clip(photo.name)
+    found = {"clip_target": clip.features, "dense_target": targets.dense(photo.name)}
+    found["regions"] = targets.regions(photo.name)
     # Clone the values, so that they are read from disk now and not during the step.
-    data: dict[str, Any] = {key: value.clone() for key, value in found.items() if value is not None}
+    data |= {key: value.clone() for key, value in found.items() if value is not None}
     return data | {"crop_sides": clip.crop_fractions}
 
 
 def to_batch(data: dict[str, Any], name: str, index: int, device: torch.device | str) -> Batch:
-    """Put a photo's data on the device, with its name and its number among the training photos."""
+    """Put a photo's data on the device, with its name and its number, training photos first."""
     batch: dict[str, Any] = {"image_idx": index, "name": name}
     for key, value in data.items():
         if isinstance(value, Tensor):
@@ -104,54 +101,70 @@ class TrainingData:
     """Memory for decoded photos, gigabytes; None: a quarter of the machine's."""
     read_ahead: int = 16
     """Number of photos read ahead of the training step."""
+    order_seed: int = 42
+    """Seed of the order of photos."""
     photo_in_hand: str = ""
     """Name of the latest training photo."""
-    _order: random.Random = field(default_factory=lambda: random.Random(ORDER_SEED))
     _left_out: set[int] = field(default_factory=set)
     _gone: int = 0
 
     def __post_init__(self) -> None:
-        self._upcoming = self._round()
+        self._order = random.Random(self.order_seed)
+        self._upcoming = self._round() if self.capture.split.train else []
+
+    @cached_property
+    def as_read(self) -> list[Photo]:
+        """Photos of both splits, training photos first, without foreground masks."""
+        side = self.config.longer_side
+        known = {photo.name: photo.at_most(side) for photo in self.capture.photos}
+        large = sum(max(photo.width, photo.height) > side for photo in self.capture.photos)
+        if large:
+            say(
+                f"{large} of {len(known)} photos are larger than {side:,} pixels and used at that size "
+                f"({data_option('longer-side')})"
+            )
+        train, held_out = self.capture.split
+        return [known[name] for name in dict.fromkeys((*train, *held_out))]
 
     @cached_property
     def photos(self) -> dict[str, Photo]:
-        """All photos by name, training photos first, with their foreground masks."""
-        known = {photo.name: photo.at_most(self.config.longer_side) for photo in self.capture.photos}
-        chosen = dict.fromkeys((*self.capture.split.train, *self.capture.split.held_out))
-        photos = [known[name] for name in chosen]
+        """All photos by name, training photos first, with their foreground masks, which are made on first
+        use."""
         folder, config = self.capture.folder, self.config
-        masked = with_foreground(photos, config, folder, self.cache_dir, self.device, say)
+        masked = with_foreground(self.as_read, config, folder, self.cache_dir, self.device, say)
         return {photo.name: photo for photo in masked}
 
-    @property
-    def train(self) -> list[Photo]:
-        """Training photos."""
-        return [self.photos[name] for name in self.capture.split.train]
+    @cached_property
+    def views(self) -> dict[str, PhotoCamera]:
+        """Cameras of all photos by name, training photos first, at the size of training."""
+        names, count = [photo.name for photo in self.as_read], len(self.capture.split.train)
+        poses = torch.from_numpy(self.capture.poses(names))
+        lenses = [photo.lens.scaled(self.scale) for photo in self.as_read]
+        return {
+            name: PhotoCamera(pose, lens.matrix.float(), lens.width, lens.height, i if i < count else None)
+            for i, (name, pose, lens) in enumerate(zip(names, poses, lenses, strict=True))
+        }
 
     @cached_property
     def cameras(self) -> list[PhotoCamera]:
         """Cameras of the training photos, at the size of training."""
-        poses = torch.from_numpy(self.capture.poses(self.capture.split.train))
-        lenses = [photo.lens.scaled(self.scale) for photo in self.train]
-        return [
-            PhotoCamera(poses[i], lens.matrix.float(), lens.width, lens.height, i)
-            for i, lens in enumerate(lenses)
-        ]
+        return [self.views[name] for name in self.capture.split.train]
 
     @cached_property
     def needs(self) -> list[Need]:
         """Needs of the scene for optional parts."""
         learns, photos = self.config.clip != "none", list(self.photos.values())
         dense, regions = self.config.makes_dense, self._regions is not None
-        plan, model = self._crops, self.capture.reconstruction
+        plan, model = self.crops, self.capture.reconstruction
         return scene_needs(photos, model, plan, learns and dense, learns and regions)
 
     @cached_property
-    def _crops(self):
+    def crops(self) -> CropPlan:
+        """Crop sizes of the photos."""
         return plan_crops(list(self.photos.values()), self.capture.reconstruction, self.config)
 
     @cached_property
-    def _regions(self):
+    def _regions(self) -> RegionSource | None:
         return region_source(self.config, self.capture.folder)
 
     @cached_property
@@ -160,11 +173,22 @@ class TrainingData:
         if self.config.clip == "none":
             return None
         fine = list(self.capture.split.train) if self.config.crops == "fine" else []
-        say(*self._crops.reasons)
+        say(*self.crops.reasons)
         return prepare(
-            list(self.photos.values()), self._crops.pixel_sizes, self.config, self._crops.scales,
+            list(self.photos.values()), self.crops.pixel_sizes, self.config, self.crops.scales,
             FeatureStore(self.cache_dir), self.device, self._regions, fine,
         )  # fmt: skip
+
+    def clean_store(self) -> tuple[int, int]:
+        """Delete targets that these settings and the photos don't use; count files and bytes. A cache outside
+        the photos' folder may be shared, so there only these photos' files go."""
+        config, used = self.config, [PHOTOS, PHOTO_MASKS]
+        used += [CLIP, FINE] if config.clip != "none" else []
+        used += [DENSE] if config.dense != "none" else []
+        used += [foreground_kind(config)] if config.foreground == "text" else []
+        used += [REGIONS] if self._regions is not None else []
+        shared = self.cache_dir.parent != self.capture.folder
+        return FeatureStore(self.cache_dir).clean(used, list(self.views), shared)
 
     def facts(self) -> SceneFacts:
         """Return what a model is built from. Raises UserError if no training photo has targets."""
@@ -182,39 +206,39 @@ class TrainingData:
                 facts.dense_targets = partial(self.targets.dense_features, usable)
         return facts
 
-    def record(self, poses: Float[Tensor, "n 3 4"]) -> SceneRecord:
-        """Describe photos, cameras and CLIP for a scene file. `poses`: those of the training photos."""
+    def record(self, poses: Float[Tensor, "n 3 4"] | None = None) -> SceneRecord:
+        """Describe photos, cameras and CLIP for a scene file. `poses`: those of the training photos (default:
+        unrefined)."""
         known = None if self.config.clip == "none" else find_model(self.config.clip, CLIP_OPTION)
-        train, held_out = self.capture.split
-        others = [name for name in held_out if name not in train]
-        frame = self.capture.recorded_frame
+        train, frame = self.capture.split.train, self.capture.recorded_frame
+        described, doubts = [], doubtful_photos(self.cache_dir)
+        for i, (name, view) in enumerate(self.views.items()):
+            pose = view.pose if poses is None or i >= len(train) else poses[i]
+            split: Literal["train", "eval"] = "train" if i < len(train) else "eval"
+            doubt = doubts.get(name)
+            described.append(ScenePhoto.of(self.photos[name], split, pose.tolist(), self.scale, doubt))
         return SceneRecord(
-            photos=[
-                *self._described(train, "train", poses),
-                *self._described(others, "eval", torch.from_numpy(self.capture.poses(others))),
-            ],
+            photos=described,
             clip=None if known is None else known.address,
             clip_identity=None if known is None else known.clip_identity,
             scale=frame.scale,
             transform=frame.transform.tolist(),
             data=str(self.capture.folder),
-        )
-
-    def _described(
-        self, names: Sequence[str], split: Literal["train", "eval"], poses: Tensor
-    ) -> list[ScenePhoto]:
-        named = zip(names, poses.tolist(), strict=True)
-        return [ScenePhoto.of(self.photos[name], split, pose, self.scale) for name, pose in named]
+        ).located(self.photos.values())
 
     # ── rounds ──────────────────────────────────────────────────────────────────────────────────────
 
     @cached_property
+    def _working(self) -> WorkingPhotos:
+        return WorkingPhotos(FeatureStore(self.cache_dir))
+
+    @cached_property
     def _cache(self) -> PhotoCache:
         targets = self.targets if self.targets_in_steps else None  # prepared now, not in the cache's thread
-        working = WorkingPhotos(FeatureStore(self.cache_dir))
+        photos = [self.photos[name] for name in self.capture.split.train]
 
         def read(index: int) -> dict[str, Any]:
-            return read_data(self.train[index], working, self.scale, targets)
+            return read_data(photos[index], self._working, self.scale, targets)
 
         return PhotoCache(read, machine_memory() / 4 if self.cache_gb is None else self.cache_gb * 1e9)
 
@@ -257,20 +281,23 @@ class TrainingData:
     def every_photo(self) -> Iterator[tuple[PhotoCamera, Batch]]:
         """Yield camera and batch, with targets, of every training photo once, without the damaged ones.
         Raises UserError if none can be read."""
-        targets, usable = self.targets, False
-        working = WorkingPhotos(FeatureStore(self.cache_dir))
-        for index, photo in enumerate(self.train):
-            if index in self._left_out:
-                continue
+        names = self.capture.split.train
+        return self.read(name for i, name in enumerate(names) if i not in self._left_out)
+
+    def read(self, names: Iterable[str]) -> Iterator[tuple[PhotoCamera, Batch]]:
+        """Yield camera and batch, with targets, of photos by name, one in memory at a time. Damaged ones are
+        left out, with a message. Raises UserError if none can be read."""
+        targets, number, usable = self.targets, {name: i for i, name in enumerate(self.views)}, False
+        for name in names:
             try:
-                data = read_data(photo, working, self.scale, targets)
+                data = read_data(self.photos[name], self._working, self.scale, targets)
             except PhotosGoneError:
                 raise
             except UserError as reason:
-                say(f"{photo.name} is left out: {reason}")
+                say(f"{name} is left out: {reason}")
                 continue
             usable = True
-            yield self.cameras[index], to_batch(data, photo.name, index, self.device)
+            yield self.views[name], to_batch(data, name, number[name], self.device)
         if not usable:
             raise UserError("none of the photos can be used: see the reasons above")
 

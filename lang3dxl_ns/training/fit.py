@@ -27,6 +27,7 @@ from lang3dxl_ns.preparation.needs import needs_table
 from lang3dxl_ns.preparation.settings import PreparationConfig
 from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.scene.capture import Capture, open_capture, say_left_out
+from lang3dxl_ns.scene.companions import cache_folder
 from lang3dxl_ns.scene.photo_folder import check_data
 from lang3dxl_ns.training.batches import TrainingData, settle
 from lang3dxl_ns.training.checkpoint import CHECKPOINT, read_checkpoint, save_checkpoint
@@ -158,6 +159,11 @@ class Run:
         """Give the Gaussians codes that represent the photos' targets."""
         learn_words(self.state, self.data.every_photo(), len(self.data.cameras))
 
+    def scene(self) -> Scene:
+        """Return the scene so far, which later training doesn't change."""
+        poses = torch.stack([self.state.pose(view) for view in self.data.cameras]).detach().cpu()
+        return snapshot(self.state, self.data.record(poses))
+
     def save(self, step: int) -> Scene:
         """Write the checkpoint after an iteration, and the scene so far."""
         state = {
@@ -171,9 +177,7 @@ class Run:
         }
         save_checkpoint(self.folder / CHECKPOINT, state)
         told = f"{self.settings.method}, {step + 1} of {self.settings.steps} iterations"
-        poses = torch.stack([self.state.pose(view) for view in self.data.cameras]).detach().cpu()
-        scene = snapshot(self.state, self.data.record(poses))
-        return replace_scene(self.path, scene, Provenance(title=self.path.stem, made_how=told))[0]
+        return replace_scene(self.path, self.scene(), Provenance(title=self.path.stem, made_how=told))[0]
 
     def resume(self) -> None:
         """Go on where the folder's checkpoint ends, if there is one."""
@@ -188,9 +192,52 @@ class Run:
             self.schedulers[name].load_state_dict(content)
         self.data.restore(saved["run"]["photos"])
         self.state.restore(saved["run"])
+        self.state.step = saved["step"]
         if self.start < self.settings.steps:
             forget_words(self.state)
         say(f"Resuming at iteration {self.start} of {self.settings.steps}")
+
+    @property
+    def is_finished(self) -> bool:
+        """Whether all iterations are done, and the words are learned."""
+        words = self.words_are_learned or not self.state.learns_words_at_the_end
+        return self.start >= self.settings.steps and words
+
+    def complete(self, stages: Stages) -> Scene:
+        """Do what is left: iterations, then words. Raises as `fit`."""
+        if self.is_finished and self.path.exists():
+            say("The run is finished already")
+            return self.scene()
+        steps = self.settings.steps
+        every, scene = min(self.settings.save_every, max(steps // 4, 1)), None
+        with stages.stage("train"), _stoppable() as stop:
+            for step in range(self.start, steps):
+                self.iterate(step)
+                stages.progress((step + 1 - self.start) / (steps - self.start))
+                if stop.is_set() or step == steps - 1 or (step + 1) % every == 0:
+                    scene = self.save(step)
+                if stop.is_set():
+                    say(f"Stopped after {step + 1} iterations. To resume: the same command")
+                    raise KeyboardInterrupt
+        if self.state.learns_words_at_the_end and not self.words_are_learned:
+            with stages.stage("words"):
+                self.learn_words()
+            self.words_are_learned, scene = True, None
+        if summary := self.guard.summary():
+            say(summary)
+        return scene or self.save(steps - 1)
+
+
+def begin(capture: Capture, settings: Settings, out: Path, cache_dir: Path, device: str | None = None) -> Run:
+    """Prepare a run, or the continuation of the folder's; see `fit`."""
+    # A group without gradients so far has a schedule all the same.
+    warnings.filterwarnings("ignore", "Detected call of .lr_scheduler.step")
+    settings.resolve()
+    out.mkdir(parents=True, exist_ok=True)
+    torch.manual_seed(settings.seed)
+    run = Run(capture, settings, out, cache_dir, device or best_device())
+    run.resume()
+    return run
 
 
 def fit(capture: Capture, settings: Settings, out: Path, cache_dir: Path, device: str | None = None) -> Scene:
@@ -207,33 +254,10 @@ def fit(capture: Capture, settings: Settings, out: Path, cache_dir: Path, device
         UserError: the photos or settings cannot be used, or the folder's run is another one.
         KeyboardInterrupt: Ctrl-C or SIGTERM stopped the run, after a checkpoint.
     """
-    # A group without gradients so far has a schedule all the same.
-    warnings.filterwarnings("ignore", "Detected call of .lr_scheduler.step")
-    settings.resolve()
-    out.mkdir(parents=True, exist_ok=True)
     stages = Stages({"prepare": 0.3, "train": 0.6, "words": 0.1})
-    torch.manual_seed(settings.seed)
     with stages.stage("prepare"):
-        run = Run(capture, settings, out, cache_dir, device or best_device())
-        run.resume()
-    every, last, scene = min(settings.save_every, max(settings.steps // 4, 1)), settings.steps - 1, None
-    with stages.stage("train"), _stoppable() as stop:
-        for step in range(run.start, settings.steps):
-            run.iterate(step)
-            stages.progress((step + 1 - run.start) / (settings.steps - run.start))
-            if stop.is_set() or step == last or (step + 1) % every == 0:
-                scene = run.save(step)
-            if stop.is_set():
-                say(f"Stopped after {step + 1} iterations. To resume: the same command")
-                raise KeyboardInterrupt
-    if run.state.learns_words_at_the_end and not run.words_are_learned:
-        with stages.stage("words"):
-            run.learn_words()
-        run.words_are_learned = True
-        scene = None
-    if summary := run.guard.summary():
-        say(summary)
-    return scene or run.save(last)
+        run = begin(capture, settings, out, cache_dir, device)
+    return run.complete(stages)
 
 
 @contextmanager
@@ -275,7 +299,7 @@ def run_folder(
     folder = Path("outputs") / (capture.folder.name or "scene") if out is None else expanded(out)
     if restart:
         (folder / CHECKPOINT).unlink(missing_ok=True)
-    cache = expanded(cache_dir or capture.folder / "lang3dxl_cache")
+    cache = cache_folder(capture.folder, cache_dir)
     return folder, fit(capture, settings, folder, cache)
 
 

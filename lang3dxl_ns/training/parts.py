@@ -13,6 +13,7 @@ from torch.nn import Parameter
 
 from lang3dxl_ns.common.device import to_device
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.options import data_option, model_option
 from lang3dxl_ns.common.reports import part
 from lang3dxl_ns.components.appearance import AppearanceField
 from lang3dxl_ns.components.compression import CompressedField
@@ -159,7 +160,7 @@ class Parts:
             if settings.appearance.use != "auto":
                 raise UserError(
                     f"the checkpoint was trained {'with' if lit else 'without'} appearance: load it with "
-                    f"--pipeline.model.appearance.use auto, or train anew"
+                    f"{model_option('appearance.use')} auto, or train anew"
                 )
             found = replace(
                 found, appearance=build_looks(settings, facts, extent).to(device) if lit else None
@@ -254,7 +255,7 @@ def _matching_semantics(
         if len(there) != len(here):
             raise UserError(
                 f"the checkpoint decodes to {kind} features of width {len(there)}, but the prepared "
-                f"targets have {len(here)}: pass the --pipeline.datamanager.{kind.lower()} "
+                f"targets have {len(here)}: pass the {data_option(kind.lower())} "
                 "that the checkpoint was trained with, or train anew"
             )
     return mine

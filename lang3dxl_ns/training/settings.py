@@ -12,6 +12,7 @@ from typing import Literal
 from lang3dxl_ns.common.checks import check_numbers
 from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.options import model_option
 from lang3dxl_ns.components.appearance import AppearanceConfig
 from lang3dxl_ns.components.decoders import DecoderConfig
 from lang3dxl_ns.components.downsampler import DownsamplerConfig
@@ -154,13 +155,13 @@ class TrainingSettings(SceneSettings):
 
     def check(self) -> None:
         """Raise UserError if a setting is out of its range."""
-        check_numbers(self, _BOUNDS, "--pipeline.model.")
+        check_numbers(self, _BOUNDS, model_option(""))
         for part, bounds in _OF_PARTS.items():
-            check_numbers(attrgetter(part)(self), bounds, f"--pipeline.model.{part.replace('_', '-')}.")
+            check_numbers(attrgetter(part)(self), bounds, model_option(f"{part.replace('_', '-')}."))
         smallest, largest = self.decode_size or (1, 1)
         if not 1 <= smallest <= largest <= 4096:
             raise UserError(
-                f"--pipeline.model.decode-size is {smallest} {largest}: give a range in 1 to 4096"
+                f"{model_option('decode-size')} is {smallest} {largest}: give a range in 1 to 4096"
             )
 
     def fit_to_run(self, iterations: int) -> None:

@@ -66,7 +66,7 @@ export class Answers {
     if (isDoubtful) return told("doubtful", `${Math.round(100 * doubt)} % of unrelated words fit this scene as well`);
     if (taught) return told("sure", "taught by example");
     if (fit < rules.faint) return told("doubtful", `${best}, and other words fit better there: it may not be here`);
-    const least = far ? Math.min(rules.clearly + rules.stricter * (foreign - 1), rules.strictest) : rules.clearly;
+    const least = far ? Math.min(rules.clearly + rules.stricter * (foreign - rules.far), rules.strictest) : rules.clearly;
     if (fit < least) return told("uncertain", `${best}, where right words reach 1.00${world}`);
     if (alike.length) return told("uncertain", `it selects the same as ${alike.join(" and ")}`);
     return told("sure", best + world);

@@ -15,8 +15,8 @@ export function say(message) {
   document.getElementById("status").textContent = message;
 }
 
-export const explain = ({ count, known, live, foreground }) =>
-  `${count.toLocaleString("en")} Gaussians. ` + (live ? "Ask for anything." : `Ask for any of ${known.toLocaleString("en")} words.`) +
+export const explain = ({ count, detail, known, live, foreground }) =>
+  `${(detail?.count ?? count).toLocaleString("en")} Gaussians. ` + (live ? "Ask for anything." : `Ask for any of ${known.toLocaleString("en")} words.`) +
   (foreground.length ? ` Matches lie on ${foreground.map(([text]) => shown(text)).join(" or ")}.` : "");
 
 export const matched = (count) => `${count.toLocaleString("en")} Gaussians match.`;

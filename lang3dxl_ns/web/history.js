@@ -1,7 +1,8 @@
 // What the page shows as an address, its steps in the browser's history (Undo, Redo, Back and Forward), and lists that
 // the browser keeps for a scene.
 
-const MOST_KEPT = 20, MOST_PROMPTS = 20;
+const MOST_KEPT = 20, MOST_TEXT = 2000;
+export const MOST_PROMPTS = 20;
 
 /** Write what is shown as fields of an address, in order: { view, walk, … } and prompts, each of them with the
  * fields `at` (a threshold that was chosen) and `hue` (its color, where that is not the next one). */
@@ -22,7 +23,7 @@ export function readFields(hash) {
   let latest = null;
   for (const [name, value] of new URLSearchParams(hash.slice(1))) {
     const number = value === "" ? NaN : Number(value);
-    if (name === "ask" || name === "like") shown.prompts.push((latest = { kind: name, text: value, hue: shown.prompts.length }));
+    if (name === "ask" || name === "like") shown.prompts.push((latest = { kind: name, text: name === "ask" ? value.slice(0, MOST_TEXT) : value, hue: shown.prompts.length }));
     else if (name === "at" && latest && number >= 0 && number <= 1) latest.at = number;
     else if (name === "hue" && latest && Number.isInteger(number) && number >= 0) latest.hue = number;
     else if (name !== "at" && name !== "hue" && name !== "prompts") shown[name] = value;

@@ -3,14 +3,16 @@
 const RIDGE = 0.01, STEPS = 8, OTHERS = 2000; // penalty, Newton steps, Gaussians that represent the scene
 
 /** Compute every Gaussian's probability of being like the examples: [{ rows, without }], Gaussians that were marked.
- * A counterexample only ever lowers it: the least of all fits without the latest counterexamples counts. */
-export function likeness(rows, examples) {
+ * rows: of the scene; judged: of the Gaussians in question, those of the scene or of a part of it. A counterexample only ever lowers it: the least of all fits without the latest counterexamples counts. */
+export function likeness(rows, examples, judged = rows) {
   const wanted = examples.filter((one) => !one.without), unwanted = examples.filter((one) => one.without);
   return unwanted.reduce((least, _, k) => {
-    const fit = remembered(rows, [...wanted, ...unwanted.slice(0, k + 1)]);
+    const fit = probability(remembered(rows, [...wanted, ...unwanted.slice(0, k + 1)]), judged);
     return least.map((value, i) => Math.min(value, fit[i]));
-  }, remembered(rows, wanted));
+  }, probability(remembered(rows, wanted), judged));
 }
+
+const probability = ({ direction, start }, rows) => rows.times(direction).map((x, i) => (rows.scales[i] ? 1 / (1 + Math.exp(-x - start)) : 0));
 
 const fits = new Map(); // of the examples that were asked latest
 const MOST_FITS = 12;
@@ -46,7 +48,7 @@ function likely(rows, examples) {
   for (const sample of samples) sample.at = [...Array.from(sample.row, (x, j) => (x - mean[j]) * scale[j]), 1];
   const weights = fitted(samples, width + 1), direction = scale.map((s, j) => s * weights[j]);
   const start = weights[width] - mean.reduce((sum, x, j) => sum + x * direction[j], 0);
-  return rows.times(direction).map((x, i) => (rows.scales[i] ? 1 / (1 + Math.exp(-x - start)) : 0));
+  return { direction, start };
 }
 
 /** Fit the logistic regression's weights by Newton's method; the last one, the constant, is hardly penalized. */

@@ -1,7 +1,7 @@
 // The list of a word's things: how many were found, one after the other, their boxes, and questions about them.
 import { element, shown } from "./cards.js";
 import { answerTo, parse, wordsOf } from "./grammar.js";
-import { Vector3 } from "./splats.js";
+import { Vector3 } from "./library.js";
 
 const NAMESPACE = "http://www.w3.org/2000/svg", CORNERS = [0, 1, 2, 3, 4, 5, 6, 7];
 const FILLED = 0.35, NARROW = 15, WIDE = 60; // share of the window that a thing fills after a flight; degrees of the lens

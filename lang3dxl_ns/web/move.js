@@ -1,5 +1,5 @@
 // The eye: orbiting and walking by mouse, touch and keys, flights, and the space where it may be.
-import { OrbitControls, PerspectiveCamera, Vector3 } from "./splats.js";
+import { OrbitControls, PerspectiveCamera, Vector3 } from "./library.js";
 
 const FLIGHT = 1200, WIDEST = 85; // milliseconds, degrees
 const TURN = 0.1, TAP = 0.1, PACE = 0.25; // radians and seconds of a key press; share of the overview's depth walked in a second

@@ -1,7 +1,9 @@
 // The page: the search box and its prompts, answers to clicks, words that are taught, and the keys.
 import { element, explain, matched, percent, promptCard, say, shown } from "./cards.js";
+import { Detail } from "./detail.js";
 import { isQuestion } from "./grammar.js";
-import { Kept, readFields, Steps, written } from "./history.js";
+import { Kept, readFields, Steps, written, MOST_PROMPTS } from "./history.js";
+import { unpacked } from "./library.js";
 import { List } from "./list.js";
 import { Photos } from "./photos.js";
 import { areExamples, asPython, drawOutline, examplesAsText, examplesFromText, inside, rounded, UNNAMED, wordsFile } from "./teach.js";
@@ -22,15 +24,18 @@ const think = thinker(
 
 // ── asking ──
 
+/** Names that hold words such as *and*, which separate prompts elsewhere. */
+const names = () => [...about.names, ...kept.list("words").map(({ name }) => String(name))];
 const commonNegatives = () => $("not").value.split(/[,;]/).map(tidy).filter(Boolean);
 
-/** Answer a prompt anew, with the common negatives. */
+/** Describe a prompt, with the common negatives, for the worker. */
+const question = ({ text, negatives, examples, inScene }) => ({ text, negatives: [...negatives, ...commonNegatives()], examples: inScene ? null : examples });
+
+/** Answer a prompt anew. */
 async function answer(prompt) {
-  const { text, chosen: threshold } = prompt, negatives = [...prompt.negatives, ...commonNegatives()];
-  const examples = prompt.inScene ? null : prompt.examples;
   const turn = (prompt.turn = {}); // a later answer to the same prompt wins
   if (prompt.examples && !prompt.examples.length) return Object.assign(prompt, { known: true, relevancy: null, threshold: null });
-  const found = await think("ask", { text, examples, negatives, threshold });
+  const found = await think("ask", { ...question(prompt), threshold: prompt.chosen });
   if (turn !== prompt.turn || !found.known) return found;
   return Object.assign(prompt, found, { views: null, box: null, finding: null });
 }
@@ -74,7 +79,7 @@ async function ask(typed, turn = cleared) {
   quiet();
   if (about.words && isQuestion(String(typed))) return answerQuestion(String(typed));
   let found = null;
-  for (const { text, negatives } of about.words ? parsePrompts(String(typed)) : []) {
+  for (const { text, negatives } of about.words ? parsePrompts(String(typed), names()) : []) {
     const word = namedWord(text) ?? { text };
     const same = () => prompts.find((prompt) => prompt.text === word.text && String(prompt.negatives) === String(negatives));
     const old = same(), prompt = old ?? { negatives, ...word };
@@ -88,6 +93,7 @@ async function ask(typed, turn = cleared) {
     if (!card.color) add(card);
     kept.store("prompts", [text, ...kept.list("prompts").filter((other) => other !== text)]);
     draw(settled ? card : null);
+    if (found.meant && found.trust.level !== "sure") offerMeant(found.meant, card);
   }
   const { known = false, doubtful = true, threshold = null, peak = 0, matching = 0 } = found ?? {};
   return { known, doubtful, threshold, peak, matching };
@@ -102,6 +108,12 @@ async function answerQuestion(typed) {
 
 function add(prompt) {
   prompts.push(Object.assign(prompt, { color: unusedColor() }));
+}
+
+/** Offer the word that a misspelled one most likely means; a click puts it in its place. */
+function offerMeant(meant, prompt) {
+  const mend = () => (prompts.includes(prompt) && remove(prompt), ask(asTyped({ text: meant, negatives: prompt.negatives })));
+  $("near").replaceChildren("Did you mean ", choice(meant, mend), "?");
 }
 
 /** Offer the words closest to an unknown one; a click puts a word in its place, in the prompt and in "But not". */
@@ -387,14 +399,13 @@ async function apply(hash, turn = drop()) {
   const common = $("not").value !== (wanted.not ?? "");
   $("not").value = wanted.not ?? "";
   try {
-    for (const one of about.words ? wanted.prompts : []) {
-      for (const specified of specify(one)) {
-        const old = common ? null : prompts.find((prompt) => String(Object.values(asField(prompt)).slice(0, 3)) === String(Object.values(asField({ ...specified, color: null })).slice(0, 3)));
-        const prompt = old ?? specified, answered = old ?? (await answer(prompt));
-        if (turn !== cleared) return;
-        if (!answered.known) offerClosest(answered, prompt);
-        else if (!found.includes(prompt)) found.push(Object.assign(prompt, { color: about.colors[one.hue % about.colors.length], open: prompt.text === open }));
-      }
+    const listed = wanted.prompts.flatMap((one) => specify(one).map((specified) => [one, specified]));
+    for (const [one, specified] of about.words ? listed.slice(0, MOST_PROMPTS) : []) {
+      const old = common ? null : prompts.find((prompt) => String(Object.values(asField(prompt)).slice(0, 3)) === String(Object.values(asField({ ...specified, color: null })).slice(0, 3)));
+      const prompt = old ?? specified, answered = old ?? (await answer(prompt));
+      if (turn !== cleared) return;
+      if (!answered.known) offerClosest(answered, prompt);
+      else if (!found.includes(prompt)) found.push(Object.assign(prompt, { color: about.colors[one.hue % about.colors.length], open: prompt.text === open }));
     }
     prompts.splice(0, prompts.length, ...found);
     list.fields = wanted;
@@ -408,7 +419,7 @@ async function apply(hash, turn = drop()) {
 
 /** Read a prompt of an address: { kind, text, at } as prompts without answers. */
 function specify({ kind, text, at }) {
-  if (kind === "ask") return parsePrompts(text).map((prompt) => ({ ...prompt, ...(at !== undefined && { chosen: at }) }));
+  if (kind === "ask") return parsePrompts(text, names()).map((prompt) => ({ ...prompt, ...(at !== undefined && { chosen: at }) }));
   const read = examplesFromText(text, about);
   if (!read || !tidy(read.name)) return [];
   return [{ text: tidy(read.name), negatives: [], examples: read.examples, named: !UNNAMED.test(read.name), ...(at !== undefined && { chosen: at }) }];
@@ -426,13 +437,14 @@ function settle(hash = null) {
 async function offer() {
   const typed = $("word").value.split(";").at(-1), before = $("word").value.slice(0, $("word").value.length - typed.length);
   const own = kept.list("words").map(({ name }) => String(name)), start = tidy(typed).toLowerCase(), offered = await think("offered", { typed });
-  const words = start ? [...own.filter((name) => name.toLowerCase().includes(start)), ...offered] : [...own, ...kept.list("prompts").map(String), ...offered];
+  const words = start ? [...own.filter((name) => name.toLowerCase().includes(start)), ...offered] : [...own, ...about.suggested, ...kept.list("prompts").map(String), ...offered];
   $("offered").replaceChildren(...[...new Set(words)].map((word) => element("option", { value: before + word })));
 }
 
 /** Suggest words to a visitor who has asked nothing yet. */
 async function suggest() {
-  const words = [...new Set([...kept.list("words").map(({ name }) => String(name)), ...(about.suggested ?? (await think("offered", { typed: "" })))])];
+  const known = about.suggested.length ? about.suggested : await think("offered", { typed: "" });
+  const words = [...new Set([...kept.list("words").map(({ name }) => String(name)), ...known])];
   $("try").replaceChildren("Try: ", ...words.slice(0, MOST_TRIED).map((word) => choice(word, () => ask(word))));
 }
 
@@ -545,15 +557,16 @@ async function chooseLook(photo) {
 /** Show the scene in a photo's lighting. */
 async function light(photo) {
   $("look").value = photo;
-  const colors = photo ? new Uint8Array(await (await fetched(about.looks[photo])).arrayBuffer()) : view.own;
-  if ($("look").value === photo && view.plain !== colors) view.light(colors); // unless a later choice has been read in the meantime
+  const colors = photo ? new Uint8Array(await (await fetched(about.looks[photo])).arrayBuffer()) : view.root.own;
+  if ($("look").value === photo && view.root.plain !== colors) view.light(colors); // unless a later choice has been read in the meantime
 }
 
 function hideFloaters() {
-  if (!view.floats) return;
+  const { floats } = view.root;
+  if (!floats) return;
   const limit = 255 - Math.round(2.55 * Number($("hide").value));
-  view.hide(view.floats, limit);
-  if (about.words) think("hide", { floats: view.floats, limit });
+  view.hide(limit);
+  if (about.words) think("hide", { floats, limit });
 }
 
 // ── start ──
@@ -573,6 +586,7 @@ async function open() {
   $("look").append(...Object.keys(about.looks).map((name) => element("option", { value: name }, name)));
   for (const control of [...$("ask").elements, $("not"), $("teach")]) control.disabled = !about.words;
   const splats = await (await fetched("splats.bin")).arrayBuffer();
+  await unpacked;
   view = new View(about, $("frame"));
   list = new List(about, think, view, prompts);
   photos = new Photos(about, view, (name) => attempt(() => light(name === null ? chosenLook : name in about.looks ? name : chosenLook)));
@@ -597,7 +611,7 @@ async function readMeaning(splats) {
 
 /** Read which Gaussians float, once the page answers. */
 async function readFloaters() {
-  view.floats = new Uint8Array(await (await fetched(about.floaters)).arrayBuffer());
+  view.root.floats = new Uint8Array(await (await fetched(about.floaters)).arrayBuffer());
   $("floating").hidden = false;
   hideFloaters();
 }
@@ -615,6 +629,7 @@ async function begin() {
   view.mover.first = location.hash.length > 1 ? null : view.mover.address;
   if (about.words) setTimeout(() => think("space").then(limit)); // behind the prompts
   setTimeout(() => attempt(readFloaters));
+  if (about.detail) new Detail(about, view, think, { read: fetched, question, failed: (error) => say(error.message) });
   if (about.hide) $("hide").value = 50;
   if (location.hash.length > 1) return apply(location.hash, turn);
   for (const [text, ...negatives] of about.prompts) if (turn === cleared) await ask(asTyped({ text, negatives }), turn);

@@ -29,9 +29,20 @@ function rotation(axis, angle) {
     t * x * z + s * y, t * y * z - s * x, c + t * z * z]; // prettier-ignore
 }
 
-/** Return the Gaussians that pixel x, y shows, as pairs of row and weight.
- * camera: { view: world → camera by columns, looking along −z; focal, width, height in pixels }. */
-export function gaussiansAt({ centers, axes, opacities }, { view, focal, width, height }, x, y, antialiased) {
+/** Return the Gaussians that pixel x, y shows: [row, weight, center]. geometries: of the scene's parts, whose rows count
+ * from `first` on; camera: { view: world → camera by columns, looking along −z; focal, width, height in pixels }. */
+export function gaussiansAt(geometries, camera, x, y, antialiased) {
+  const hits = geometries.flatMap((geometry) => hitsOf(geometry, camera, x, y, antialiased));
+  let clear = 1;
+  return hits.sort((a, b) => a[0] - b[0]).map(([, row, alpha, center]) => {
+    const weight = clear * alpha;
+    clear -= weight;
+    return [row, weight, center];
+  });
+}
+
+/** List what a pixel shows of one part: [depth, row, opacity, center]. */
+function hitsOf({ centers, axes, opacities, first = 0 }, { view, focal, width, height }, x, y, antialiased) {
   const hits = [];
   const [widest, highest] = [width, height].map((side) => (MARGIN * side) / 2 / focal);
   const within = (slope, most) => Math.max(-most, Math.min(slope, most));
@@ -58,23 +69,17 @@ export function gaussiansAt({ centers, axes, opacities }, { view, focal, width, 
     vv += BLUR;
     const area = uu * vv - uv * uv, far = (vv * du * du - 2 * uv * du * dv + uu * dv * dv) / area;
     const alpha = opacities[i] * Math.exp(-far / 2) * (antialiased ? Math.sqrt(Math.max(sharp / area, 0)) : 1);
-    if (alpha > 1 / 255) hits.push([depth, i, Math.min(alpha, 0.999)]);
+    if (alpha > 1 / 255) hits.push([depth, first + i, Math.min(alpha, 0.999), [a, b, c]]);
   }
-  let clear = 1;
-  return hits.sort((a, b) => a[0] - b[0]).map(([, i, alpha]) => {
-    const weight = clear * alpha;
-    clear -= weight;
-    return [i, weight];
-  });
+  return hits;
 }
 
 /** Compute the place of what a pixel shows: the center of the Gaussian with which half of its weight is reached. */
-export function middleOf({ centers }, hits) {
+export function middleOf(hits) {
   const total = hits.reduce((sum, [, weight]) => sum + weight, 0);
   if (total < 0.1) return null;
   let before = 0;
-  const [row] = hits.find(([, weight]) => (before += weight) >= total / 2);
-  return [0, 1, 2].map((axis) => centers[3 * row + axis]);
+  return hits.find(([, weight]) => (before += weight) >= total / 2)[2];
 }
 
 /** Choose the view in which most of the points ({ point, row }) are visible, the preferred ones first, then by how

@@ -1,8 +1,10 @@
 // The picture: splats drawn with WebGL (Spark, three.js), their colors, and places on the screen.
 import { Mover, still } from "./move.js";
-import { PackedSplats, Scene, SparkRenderer, SplatMesh, Vector3, WebGLRenderer } from "./splats.js";
+import { Part } from "./part.js";
+import { Scene, SparkRenderer, Vector3, WebGLRenderer } from "./library.js";
+import { FAN } from "./tree.js";
 
-const HEAT = 0.7, BLUR = 0.3; // opacity, square pixels
+const BLUR = 0.3; // square pixels
 const FLUENT = 40, COARSEST = 0.3, STILL = 150; // milliseconds of a frame, least share of pixels a side, milliseconds
 
 export class View extends EventTarget {
@@ -10,7 +12,7 @@ export class View extends EventTarget {
    * `double` (a double click). */
   constructor(about, frame) {
     super();
-    Object.assign(this, { about, frame });
+    Object.assign(this, { about, frame, parts: new Map(), heat: () => undefined }); // parts: by number, chunk 0 first; heat: see Part.paint
     this.renderer = new WebGLRenderer({ antialias: false });
     Object.assign(this, { cost: 4 * FLUENT, sharp: false, changed: false, asked: false, drawing: null, order: "" });
     const [red, green, blue] = about.background.map((value) => Math.round(255 * value));
@@ -34,23 +36,42 @@ export class View extends EventTarget {
 
   /** Draw packed splats, 16 bytes each. */
   async show(buffer) {
-    const words = new Uint32Array(buffer), count = words.length / 4;
-    this.packed = new PackedSplats({ maxSplats: count });
-    await this.packed.initialized;
-    this.packed.ensureSplats(count).set(words);
-    this.packed.numSplats = count;
-    this.bytes = new Uint8Array(this.packed.packedArray.buffer, this.packed.packedArray.byteOffset);
-    this.own = this.plain = Uint8Array.from({ length: 4 * count }, (_, i) => this.bytes[16 * (i >> 2) + (i & 3)]);
-    this.splats = new SplatMesh({ packedSplats: this.packed });
-    this.splats.position.fromArray(this.about.center);
-    this.scene.add(this.splats);
-    await this.splats.initialized;
+    const root = await Part.of(buffer, this.about.center);
+    this.scene.add(root.mesh);
+    this.root = root;
+    this.parts.set(0, root);
     this.recolor();
+  }
+
+  /** Draw a chunk in place of a quarter of its parent. */
+  async add(buffer, number, floats) {
+    const part = await Part.of(buffer, this.about.center, number, floats);
+    part.light(this.root.own, this.root.plain);
+    this.parts.set(number, part);
+    this.repaint(number);
+    this.scene.add(part.mesh);
+    this.cover(number, true);
+  }
+
+  /** Draw a quarter of a chunk's parent in its place. */
+  remove(number) {
+    const part = this.parts.get(number);
+    this.parts.delete(number);
+    this.cover(number, false);
+    this.scene.remove(part.mesh);
+    part.dispose();
+  }
+
+  cover(number, covered) {
+    const parent = Math.floor((number - 1) / FAN);
+    this.parts.get(parent).covered[(number - 1) % FAN] = covered;
+    this.repaint(parent);
   }
 
   /** Set the colors and opacities of all splats, four bytes each, before heat. */
   light(colors) {
-    this.plain = colors;
+    this.root.plain = colors;
+    for (const part of this.parts.values()) if (part.number) part.light(this.root.own, colors);
     this.layers = null;
     this.recolor(this.shown);
   }
@@ -58,31 +79,25 @@ export class View extends EventTarget {
   /** Show heat: layers of { relevancy, threshold, peak, color }, the strongest where several match. */
   recolor(layers = []) {
     const told = [this.limit, this.only, ...layers.flatMap(({ relevancy, threshold, color }) => [relevancy, threshold, color])];
-    if (!this.splats || (told.length === this.layers?.length && told.every((value, k) => value === this.layers[k]))) return;
+    if (!this.root || (told.length === this.layers?.length && told.every((value, k) => value === this.layers[k]))) return;
     Object.assign(this, { layers: told, shown: layers });
-    for (let i = 0; i < this.plain.length / 4; i++) {
-      let best = 0, chosen = null;
-      for (const layer of layers) {
-        if (layer.relevancy[i] > layer.threshold && layer.relevancy[i] > best) [best, chosen] = [layer.relevancy[i], layer];
-      }
-      const warmth = chosen && (best - chosen.threshold) / Math.max(chosen.peak - chosen.threshold, 1e-6);
-      const share = chosen ? HEAT * (0.5 + 0.5 * Math.min(warmth, 1)) : 0;
-      for (let k = 0; k < 3; k++) this.bytes[16 * i + k] = this.plain[4 * i + k] * (1 - share) + (chosen?.color[k] ?? 0) * share;
-      this.bytes[16 * i + 3] = this.floats?.[i] > this.limit || (this.only && !this.only.has(i)) ? 0 : this.plain[4 * i + 3];
-    }
-    this.upload();
+    for (const number of this.parts.keys()) this.repaint(number);
+    this.dispatchEvent(new Event("heated"));
   }
 
-  /** Hide the Gaussians that float more than a limit, 0…255; floats: how much each one does. */
-  hide(floats, limit) {
-    Object.assign(this, { floats, limit });
+  repaint(number) {
+    this.parts.get(number)?.paint(this.shown ?? [], this.heat, this.limit, this.only);
+    this.wake();
+  }
+
+  /** Hide the Gaussians that float more than a limit, 0…255. */
+  hide(limit) {
+    this.limit = limit;
     this.recolor(this.shown);
   }
 
   upload() {
-    if (!this.splats) return;
-    this.packed.needsUpdate = true;
-    this.splats.updateVersion();
+    for (const part of this.parts.values()) part.upload();
     this.wake();
   }
 
@@ -108,7 +123,7 @@ export class View extends EventTarget {
   step(now) {
     this.asked = false;
     if (this.lost) return; // until the browser restores the context
-    if (!this.splats || !this.drawn()) return this.splats && this.request();
+    if (!this.root || !this.drawn()) return this.root && this.request();
     this.mover.update(now);
     if (this.changed) {
       this.draw(Math.max(Math.min(Math.sqrt(FLUENT / this.cost), 1), COARSEST));

@@ -9,21 +9,25 @@ export const tidy = (text) => text.replace(/["\0]/g, " ").split(/\s+/).filter(Bo
 // ── what people type, as in Python's query/language.py; both read query/language.json ──
 
 const HELD = "\ue000"; // stands for a separator that is part of a phrase
-const any = (kind) => [...language[kind]].sort((a, b) => b.length - a.length).join("|");
+const longest = (phrases) => [...phrases].sort((a, b) => b.length - a.length).join("|");
+const any = (kind) => longest(language[kind]);
+const literal = (text) => text.replace(/[.*+?^${}()|[\]\\]/g, "\\$&");
 const L = "[\\p{L}\\p{N}_]";
-const whole = (kind) => new RegExp(`(?<!${L})(?:${any(kind)})(?!${L})`, "giu");
+const wholeOf = (phrases) => new RegExp(`(?<!${L})(?:${longest(phrases)})(?!${L})`, "giu");
+const whole = (kind) => wholeOf(language[kind]);
 const leading = (kinds) => new RegExp(`^(?:${kinds.map(any).join("|")})\\s+(?=\\S)`, "iu");
 const WHERE = new RegExp(
   `\\s+(?:${any("before_places")})\\s+(?:the\\s+)?(?:${any("places")})(?!${L}).*$` +
   `|^(?:${any("places")}|${any("sizes")})\\s+(?!of(?!${L}))(?=\\S)|\\s+(?:${any("after")})$`, "giu"); // prettier-ignore
 
-/** Parse prompts, each with negatives: `windows and doors; dome not roof`. Quotes protect a phrase. */
-export function parsePrompts(typed) {
+/** Parse prompts, each with negatives: `windows and doors; dome not roof`. Quotes protect a phrase; names are never
+ * split. */
+export function parsePrompts(typed, names = []) {
   const held = [], hold = (text) => HELD + (held.push(text) - 1) + HELD;
-  const plain = typed.replace(/‘([^‘’]*)’|[“”„«»]/g, (_, quoted) => (quoted === undefined ? '"' : `"${quoted}"`)).replaceAll("\0", " ");
+  const plain = typed.replace(/‘([^‘’]*)’|[“”„«»]/g, (_, quoted) => (quoted === undefined ? '"' : `"${quoted}"`)).replace(/[\0\s]+/g, " ").trim();
   const restored = (text) => tidy(text.replace(new RegExp(`${HELD}(\\d+)${HELD}`, "g"), (_, i) => held[i]));
   const listed = (text) => text.split(",").flatMap((piece) => piece.split(whole("and"))).filter((part) => part.trim());
-  const parts = plain.replace(/"[^"]*"/g, hold).replace(whole("one"), hold).split(";");
+  const parts = plain.replace(/"[^"]*"/g, hold).replace(wholeOf([...language.one, ...names.map(tidy).filter(Boolean)].map(literal)), hold).split(";");
   return parts
     .flatMap((part) => {
       const [wanted, ...others] = part.split(whole("not")), negatives = others.flatMap(listed).map(restored).filter(Boolean);

@@ -6,11 +6,14 @@ import { likeness } from "./like.js";
 import { bestPhoto, gaussiansAt, middleOf, unpackSplats } from "./pick.js";
 import { freeSpace } from "./space.js";
 import { isPresent, Known, thingsOf } from "./things.js";
+import { ancestry, FAN } from "./tree.js";
 import { Vocabulary } from "./vocabulary.js";
 
 const EXAMPLE = 5; // number of Gaussians that represent a clicked place
 const INSIDE = 60; // Gaussians that represent an outlined place
-let about, answers, vocabulary, geometry, views, mass, opacities, known;
+let about, answers, vocabulary, geometry, views, mass, field, known;
+const parts = new Map(); // of the scene, by number: { geometry, opacities, floats, answers, root }; chunk 0 is the whole scene
+let limit = 255;
 
 /** Look up phrases; return their numbers, and the first phrase that is unknown. */
 async function understood(phrases) {
@@ -41,6 +44,41 @@ async function file(name) {
   return answer;
 }
 
+/** Read rows of codes, or rows that were decoded beforehand. */
+const rowsOf = (buffer, count, tell) => (field ? decodedRows({ ...about.words, count }, buffer, field, tell) : shippedRows({ ...about.words, count }, buffer));
+
+// ── parts ──
+
+function hold(number, { centers, axes, opacities }, answers, floats) {
+  const count = opacities.length, first = number * count, root = ancestry(number, count);
+  parts.set(number, { geometry: { centers, axes, opacities, first }, opacities, answers, floats, root });
+  reveal(number);
+}
+
+/** Compute which Gaussians of a part are drawn: no floaters, and none that children show in more detail. */
+function reveal(number) {
+  const part = parts.get(number);
+  if (!part) return;
+  const covered = [0, 1, 2, 3].map((k) => parts.has(FAN * number + 1 + k)), quarter = part.opacities.length / FAN;
+  part.geometry.opacities = part.opacities.map((opacity, i) => (part.floats?.[i] > limit || covered[Math.floor(i / quarter)] ? 0 : opacity));
+}
+
+/** Return a Gaussian of some part by its number: its rows, its place in them, and the row of chunk 0 that stands for it. */
+function gaussian(id) {
+  const count = about.words.count, number = Math.floor(id / count), { answers: { rows }, root } = parts.get(number), i = id - number * count; // prettier-ignore
+  return { rows, i, root: root(i) };
+}
+
+/** List what a pixel shows: [number, weight, center] of Gaussians with a meaning. */
+function meantAt(camera, x, y) {
+  return hitsAt(camera, x, y).filter(([id]) => {
+    const { rows, i } = gaussian(id);
+    return rows.scales[i];
+  });
+}
+
+const hitsAt = (camera, x, y) => gaussiansAt([...parts.values()].map(({ geometry }) => geometry), camera, x, y, about.antialiased);
+
 const bytes = async (name) => (await file(name)).arrayBuffer();
 
 const jobs = {
@@ -50,13 +88,12 @@ const jobs = {
     const [listed, numbers] = [await (await file("vocabulary.json")).json(), await bytes("vocabulary.bin")];
     vocabulary = new Vocabulary(listed, numbers, words.width, about.live);
     const tell = (done) => new Promise((go) => (postMessage({ done }), setTimeout(go)));
-    const rows = words.field
-      ? await decodedRows(words, await bytes("codes.bin"), await bytes("field.bin"), tell)
-      : shippedRows(words, await bytes("rows.bin"));
+    field = words.field && (await bytes("field.bin"));
+    const rows = await rowsOf(await bytes(words.field ? "codes.bin" : "rows.bin"), words.count, tell);
     answers = new Answers(rows, vocabulary, words);
     geometry = unpackSplats(splats);
     geometry.bytes = new Uint8Array(splats);
-    opacities = geometry.opacities;
+    hold(0, geometry, answers, null);
     views = readViews(about, await bytes("views.bin")).map((view) => ({
       ...view,
       pose: view.pose.map((row, axis) => (axis < 3 ? [...row.slice(0, 3), row[3] - about.center[axis]] : row)),
@@ -73,7 +110,31 @@ const jobs = {
     if (examples) return { known: true, ...answers.verdict(likeness(answers.rows, examples), { strict: true, doubt: 0, threshold }) };
     const { found, unknown } = await understood([text, ...negatives]);
     if (unknown !== undefined) return { known: false, unknown, closest: vocabulary.closest(unknown) };
-    return { known: true, taught: Boolean(found[0].taught), ...judged(found, threshold) };
+    return { known: true, taught: Boolean(found[0].taught), meant: found[0].meant, ...judged(found, threshold) };
+  },
+
+  /** Read a chunk of more detail: splats, floaters, and codes or rows. */
+  async part({ number, buffer }) {
+    const { count } = about.words, rows = await rowsOf(buffer.slice(17 * count), count);
+    hold(number, unpackSplats(buffer.slice(0, 16 * count)), new Answers(rows, vocabulary, about.words), new Uint8Array(buffer, 16 * count, count));
+    reveal(Math.floor((number - 1) / FAN));
+    return {};
+  },
+
+  drop({ number }) {
+    parts.delete(number);
+    reveal(Math.floor((number - 1) / FAN));
+    return {};
+  },
+
+  /** Compute the relevancy of some chunks' Gaussians to a phrase or examples that the scene has been asked for. */
+  async fine({ text, negatives, examples, numbers }) {
+    const { found } = examples ? {} : await understood([text, ...negatives]), { foreground } = answers;
+    return numbers.filter((number) => parts.has(number)).map((number) => {
+      const { answers: own, root } = parts.get(number);
+      const relevancy = examples ? likeness(answers.rows, examples, own.rows) : own.relevancy(found[0], found.slice(1).map((one) => one.own));
+      return { number, relevancy: foreground ? relevancy.map((value, i) => value * foreground[root(i)]) : relevancy };
+    });
   },
 
   find({ relevancy, threshold }) {
@@ -95,20 +156,23 @@ const jobs = {
 
   /** Find the words that match a pixel best, and its Gaussians; none where too few of them have a meaning. */
   whatIs({ camera, x, y, most }) {
-    const hits = gaussiansAt(geometry, camera, x, y, about.antialiased).filter(([i]) => answers.rows.scales[i]);
+    const hits = meantAt(camera, x, y);
     const blend = new Float64Array(about.words.width);
     let covered = 0;
-    for (const [i, weight] of hits) {
-      answers.rows.row(i).forEach((value, j) => (blend[j] += weight * value));
+    for (const [id, weight] of hits) {
+      const { rows, i } = gaussian(id);
+      rows.row(i).forEach((value, j) => (blend[j] += weight * value));
       covered += weight;
     }
     if (covered < about.words.covered) return { words: [], rows: [] };
-    return { words: answers.naming(blend, most), rows: hits.sort((a, b) => b[1] - a[1]).slice(0, EXAMPLE).map(([i]) => i) };
+    return { words: answers.naming(blend, most), rows: [...new Set(hits.sort((a, b) => b[1] - a[1]).slice(0, EXAMPLE).map(([id]) => gaussian(id).root))] };
   },
 
   /** Hide the Gaussians that float more than a limit, 0…255, from clicks. */
-  hide({ floats, limit }) {
-    geometry = { ...geometry, opacities: opacities.map((opacity, i) => (floats[i] > limit ? 0 : opacity)) };
+  hide({ floats, limit: least }) {
+    limit = least;
+    parts.get(0).floats = floats;
+    for (const number of parts.keys()) reveal(number);
     return {};
   },
 
@@ -120,7 +184,7 @@ const jobs = {
 
   /** Find the point of the world at a pixel; null where nothing is. */
   point({ camera, x, y }) {
-    const middle = middleOf(geometry, gaussiansAt(geometry, camera, x, y, about.antialiased));
+    const middle = middleOf(hitsAt(camera, x, y));
     return middle && middle.map((value, axis) => value + about.center[axis]);
   },
 
@@ -129,10 +193,11 @@ const jobs = {
   mark({ camera, pixels, prefer, most = EXAMPLE }) {
     const weights = new Map(), points = [];
     for (const [x, y] of pixels) {
-      const hits = gaussiansAt(geometry, camera, x, y, about.antialiased).filter(([i]) => answers.rows.scales[i]);
-      const strong = hits.sort((a, b) => b[1] - a[1]).slice(0, EXAMPLE);
+      const hits = meantAt(camera, x, y);
+      const middle = middleOf(hits);
+      const strong = hits.sort((a, b) => b[1] - a[1]).slice(0, EXAMPLE).map(([id, weight]) => [gaussian(id).root, weight]);
       for (const [i, weight] of strong) weights.set(i, (weights.get(i) ?? 0) + weight);
-      if (strong.length) points.push({ point: middleOf(geometry, hits), row: strong[0][0] });
+      if (strong.length) points.push({ point: middle, row: strong[0][0] });
     }
     const rows = [...weights].sort((a, b) => b[1] - a[1]).slice(0, pixels.length > 1 ? INSIDE : most).map(([i]) => i);
     const found = bestPhoto(views, points, prefer.map((name) => views.findIndex((view) => view.name === name)));

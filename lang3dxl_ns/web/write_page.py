@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import hashlib
 import json
 import re
@@ -24,15 +25,16 @@ from lang3dxl_ns.files.scene_file import Provenance
 from lang3dxl_ns.query import view_ranking
 from lang3dxl_ns.query.doubt import BEST, DOUBTFUL, DOUBTFUL_TAUGHT, LEAST_PEAK
 from lang3dxl_ns.query.heat_maps import PROMPT_COLORS
-from lang3dxl_ns.query.language import TABLE
+from lang3dxl_ns.query.language import TABLE, phrases_of
 from lang3dxl_ns.query.negatives import CLEAR, NOTHING, competitors
 from lang3dxl_ns.query.scene import NO_SEMANTICS, Scene
 from lang3dxl_ns.query.text import Prompt, tidy
 from lang3dxl_ns.query.thresholds import EVEN, SHARE
 from lang3dxl_ns.query.trust import ALIKE, ANCHORS, CLEARLY, FAINT, FAR, STRICTER, STRICTEST
 from lang3dxl_ns.query.visibility import spread
-from lang3dxl_ns.query.vocabulary import common_words, same_thing, shipped_vocabulary
+from lang3dxl_ns.query.vocabulary import closest_word, common_words, same_thing, shipped_vocabulary
 from lang3dxl_ns.things import find, grammar, join, pieces, thing
+from lang3dxl_ns.web.levels import MOST_ROWS, SMALL, Levels, levels_of
 from lang3dxl_ns.web.pack import (
     LEAST_PIXELS,
     PIXEL_STEPS,
@@ -51,7 +53,10 @@ from lang3dxl_ns.words.taught_words import TaughtWord, known_word
 _HERE = Path(__file__).parent
 _INDEX = _HERE / "index.html"
 # The index comes first: it marks the folder of a page whose writing was stopped as ours.
-_FILES = [_INDEX, *(path for path in _HERE.iterdir() if path.suffix in (".css", ".js", ".txt"))]
+_LIBRARY = _HERE / "splats.js"
+_FILES = [_INDEX, *(p for p in _HERE.iterdir() if p.suffix in (".css", ".js", ".txt") and p != _LIBRARY)]
+_MADE = ["language.js", "spark.bin"]
+"""Files of every page that are made from others, and whose names its modules know."""
 _MOST_BYTES = 8_000_000
 """Most bytes of the views that the page flies to, and of the lightings; evenly spaced ones are kept."""
 _RULES = {
@@ -60,6 +65,11 @@ _RULES = {
     **{"clearly": CLEARLY, "stricter": STRICTER, "strictest": STRICTEST, "far": FAR},
 }
 """Numbers that decide what matches, what is doubtful and what a place is called, for the page's answers."""
+_SUGGESTED = (
+    "windows", "doors", "towers", "spires", "domes", "minarets", "roof", "arches", "columns", "balconies",
+    "statues", "stairs", "chimneys", "clock", "trees", "cars", "grass",
+)  # fmt: skip
+"""Words that a first visitor is offered, where the scene knows them."""
 _RANKING = ("PEAK", "LARGE", "RIM", "STRONG", "CORE", "JOINED", "OUTLIERS", "DENSE")
 _THINGS = (
     (pieces, "LEVELS PART DEPTH"),
@@ -72,7 +82,7 @@ _THINGS = (
 _TEXTS = 256
 """Number of texts encoded at a time."""
 _DATA = re.compile(
-    r"(splats|codes|field|rows|vocabulary|views|look\d+|photo\d+)\.[0-9a-f]{12}\.(bin|json|jpg)"
+    r"(splats|codes|field|rows|vocabulary|views|look\d+|photo\d+|part\d+)\.[0-9a-f]{12}\.(bin|json|jpg)"
 )
 """Names of a page's data files. Nothing else in its folder is ever deleted."""
 MOST_TEXT = 2_000
@@ -102,12 +112,19 @@ class Page:
     """Whether a server encodes any other text (`answer`)."""
     own_words: PageWords = field(default_factory=PageWords)
     """Words that are taught from a live page."""
+    large: int = SMALL
+    """Most Gaussians of a page without levels of detail."""
     left_out: list[str] = field(default_factory=list)
     """Sentences about what the files leave out because of its size."""
 
     def __post_init__(self) -> None:
-        """Parse prompts, and pack what Gaussians mean. Raises UserError if that is too large for a page, or
-        if a scene with colors alone is asked for texts."""
+        """Parse prompts, merge the Gaussians of a large scene, and pack what Gaussians mean. Raises UserError
+        if that is too large for a page, or if a scene with colors alone is asked for texts."""
+        self.whole = self.scene
+        self.levels: Levels | None = None
+        if len(self.scene.splats) > self.large:
+            self.levels = levels_of(self.scene, min(self.large, MOST_ROWS))
+            self.scene = self.levels.scenes[0]
         scene, within = self.scene, self.scene.config.foreground
         self.prompts = scene.prompts(list(self.texts)) if self.texts else []
         self._foreground = scene.prompts(within) if within else []
@@ -125,7 +142,10 @@ class Page:
         means = scene.splats.means[scene.splats.sound()]
         center = means.median(0).values if len(means) else self._toward
         files = {path.name: path.read_bytes() for path in _FILES}
-        files["language.js"] = language_module()
+        files["language.js"], files["spark.bin"] = (
+            language_module(),
+            gzip.compress(_LIBRARY.read_bytes(), mtime=0),
+        )
         files["splats.bin"] = pack_splats(scene.baked(self.look), center, self._toward).tobytes()
         up = np.mean([photo.pose[:3, 1] for photo in scene.photos], axis=0)
         told = self.provenance
@@ -143,6 +163,11 @@ class Page:
             "prompts": _phrases(self.prompts),
             "words": None,
         }
+        if self.levels is not None:
+            files |= self._chunks(self.levels, center)
+            bounds = [self.levels.bounds(number) for number in range(self.levels.chunks)]
+            count = len(self.whole.splats)
+            about["detail"] = {"rows": self.levels.rows, "chunks": bounds, "count": count}
         files |= self._photos(about)
         about["floaters"], about["hide"] = "api/floaters" if self.live else "floaters.bin", self.hide_floaters
         if not self.live:
@@ -172,8 +197,36 @@ class Page:
                 for name in views
             ]
             about["foreground"] = _phrases(self._foreground)
+            named = _distinct([*(word.name for word in scene.words.values()), *self.words, *self.more])
+            several = filter(re.compile(r"[\s,]").search, named)
+            about["names"] = [name for name in several if phrases_of(name) != [(name, [])]]
+            about["suggested"] = self._suggested()
         about["left_out"] = self.left_out
         files["scene.json"] = json.dumps(about).encode()
+        return files
+
+    def _suggested(self) -> list[str]:
+        """List words that the scene answers surely, each with matches of its own: taught ones come first."""
+        words = [*(word.name for word in self.scene.words.values()), *_SUGGESTED]
+        question, chosen = self.scene.ask([Prompt(word) for word in words]), list[int]()
+        for row, (trust, own) in enumerate(zip(question.trusts, question.gaussians, strict=True)):
+            others = question.gaussians[chosen]
+            same = (own & others).sum(1) > ALIKE * (own | others).sum(1)
+            if trust.level == "sure" and bool(own.any()) and not bool(same.any()):
+                chosen.append(row)
+        return [words[row] for row in chosen]
+
+    def _chunks(self, levels: Levels, center: Float[Tensor, "3"]) -> dict[str, bytes]:
+        """Pack the chunks that show more detail: splats, floaters, and what the Gaussians mean."""
+        files, colored = dict[str, bytes](), [scene.baked(self.look) for scene in levels.scenes]
+        for number in tracked(range(1, levels.chunks), "packing details"):
+            scene, rows = levels.chunk(number)
+            splats = colored[levels.scenes.index(scene)].select(torch.arange(rows.start, rows.stop))
+            parts = [pack_splats(splats, center, self._toward).tobytes(), _bytes(scene.floating[rows])]
+            if scene.decoder is not None and scene.codes is not None:
+                packed = pack_meaning(scene.decoder, scene.codes[rows]).files
+                parts.append(packed.get("codes.bin") or packed["rows.bin"])
+            files[f"part{number}.bin"] = b"".join(parts)
         return files
 
     def _photos(self, about: dict[str, Any]) -> dict[str, bytes]:
@@ -257,7 +310,8 @@ class Page:
         near, against = self._meant(self._meaning, text)
         vector = self.scene.text.vectors([text]).to(self.scene.device)
         own = self._meaning.of_texts(vector)[0].tolist()
-        told: dict[str, Any] = {"own": own, "near": near.tolist(), "against": against}
+        meant = closest_word(text, (*self.scene.words, *common_words()))
+        told: dict[str, Any] = {"own": own, "near": near.tolist(), "against": against, "meant": meant}
         known = self.scene.words.get(known_word(text))
         return told if known is None else told | {"taught": self._taught(self._meaning, known)}
 
@@ -268,7 +322,8 @@ class Page:
 
     def teach(self, content: Mapping[str, Any]) -> dict[str, Any]:
         """Teach the scene a word that is marked in the page; see `PageWords.teach`."""
-        self.scene, told = self.own_words.teach(self.scene, content)
+        self.whole, told = self.own_words.teach(self.whole, content)
+        self.scene = self.scene.with_words(self.whole.words.values()) if self.levels else self.whole
         return {"told": told}
 
     def photo(self, name: str) -> bytes:
@@ -279,7 +334,7 @@ class Page:
 
     def floaters(self) -> bytes:
         """Compute how surely each Gaussian is a floater, a byte each."""
-        return (self.scene.floating * 255).round().byte().cpu().numpy().tobytes()
+        return _bytes(self.scene.floating)
 
     def colors(self, photo: str) -> bytes:
         """Compute every Gaussian's color and opacity in a photo's look. Raises UserError if there is none."""
@@ -293,6 +348,10 @@ def language_module() -> bytes:
     table["grammar"] = grammar.table()
     table["things"] = {name: getattr(module, name) for module, names in _THINGS for name in names.split()}
     return f"export default {json.dumps(table, ensure_ascii=False)};\n".encode()
+
+
+def _bytes(shares: Float[Tensor, " n"]) -> bytes:
+    return (shares * 255).round().byte().cpu().numpy().tobytes()
 
 
 def _phrases(prompts: Sequence[Prompt]) -> list[list[str]]:
@@ -311,7 +370,7 @@ def write_page(page: Page, folder: Path) -> int:
     make_folder(folder)
     index, names = (
         folder / _INDEX.name,
-        {*(path.name for path in _FILES), "scene.json", "vocabulary.json", "language.js"},
+        {*(path.name for path in _FILES), "scene.json", "vocabulary.json", *_MADE},
     )
     ours = index.is_file() and "<title>A scene to ask</title>" in index.read_text(errors="replace")
     other = (".bin", *PHOTO_SUFFIXES)  # whoever serves a folder of photos would publish them
@@ -320,7 +379,7 @@ def write_page(page: Page, folder: Path) -> int:
     if taken and not ours:
         raise UserError(f"{folder} holds {taken[0]}, which is not a scene's page: name a folder of its own")
     files = page.files()
-    own = [*(path.name for path in _FILES), "language.js"]  # modules import each other by these names
+    own = [*(path.name for path in _FILES), *_MADE]  # modules import each other by these names
     data = sorted(files.keys() - {*own})
     data.remove("scene.json")
     # Data have names by content, which scene.json lists: a page whose writing is stopped, or whose files a

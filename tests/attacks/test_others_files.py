@@ -3,6 +3,8 @@
 import json
 import os
 import stat
+import threading
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -10,12 +12,17 @@ import pytest
 import torch
 from painted_scene import CHANNELS, encode_texts, painted_scene
 
+from lang3dxl_ns import load_scene, train
+from lang3dxl_ns.commands.teach import forgotten
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import file_locked, locked, replace_file, set_aside
 from lang3dxl_ns.components.decoders import DecoderConfig, make_decoder
 from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
+from lang3dxl_ns.files.read_splats import read_splats
 from lang3dxl_ns.files.scene_file import Provenance, read_scene, replace_scene, write_scene
 from lang3dxl_ns.preparation.store import FeatureStore
+from lang3dxl_ns.scene.capture import open_capture
+from lang3dxl_ns.scene.companions import cache_folder
 from lang3dxl_ns.scene.record import same_clip
 from lang3dxl_ns.web.write_page import Page, write_page
 from lang3dxl_ns.words.taught_words import TaughtWord, load_words, mask_of, save_words
@@ -73,6 +80,51 @@ def test_a_store_enters_no_linked_folder(tmp_path):
     assert other.read("clip", "a.jpg")["x"].sum() == 3
     with pytest.raises(UserError, match="is a link"):
         store.write("zz", "a.jpg", {"x": torch.ones(3)}, SETTINGS)
+
+
+def test_a_cache_that_came_as_a_link_is_refused_and_a_named_one_is_the_users(tmp_path):
+    (tmp_path / "theirs").mkdir()
+    (tmp_path / "data").mkdir()
+    (tmp_path / "data" / "lang3dxl_cache").symlink_to(tmp_path / "theirs")
+    with pytest.raises(UserError, match=rf"is a link: .*cache-dir {tmp_path}/theirs"):
+        cache_folder(tmp_path / "data", None)
+    linked = tmp_path / "data" / "lang3dxl_cache"
+    assert cache_folder(tmp_path / "data", linked) == linked
+    assert cache_folder(tmp_path, None) == tmp_path / "lang3dxl_cache"
+
+
+@pytest.mark.parametrize("path", ["a" * 5000, "a/" * 3000, "a\0.scene", "a" * 300 + ".ply"])
+def test_what_is_no_path_is_told_in_one_line_wherever_one_is_given(path):
+    calls = (load_scene, open_capture, read_splats, painted_scene().export, train)
+    for call in calls:
+        with pytest.raises(UserError, match="is no path: it is too long, or holds a null character"):
+            call(path)
+
+
+def test_a_command_that_waits_for_another_says_so(tmp_path, capsys):
+    """The other may have been stopped by Ctrl-Z."""
+    told, done = threading.Event(), threading.Event()
+
+    def wait():
+        with file_locked(tmp_path / "a.scene"):
+            done.set()
+
+    with file_locked(tmp_path / "a.scene"):
+        threading.Thread(target=wait, daemon=True).start()
+        for _ in range(500):
+            if "Waiting for another command that writes in" in capsys.readouterr().out:
+                told.set()
+                break
+            time.sleep(0.01)
+        assert told.is_set() and not done.is_set()
+    assert done.wait(5)
+
+
+@pytest.mark.parametrize("number", ["1" * 5000, "²", "0", "-1", ""])
+def test_forgetting_an_example_that_no_number_names_is_one_line(number, word):
+    scene = painted_scene().with_words([replace(word, vector=torch.ones(CHANNELS))])
+    with pytest.raises(UserError, match="was not taught: lang3dxl words lists"):
+        forgotten(scene, f"gizmo/{number}")
 
 
 def test_of_a_shared_store_other_scenes_entries_stay(tmp_path, capsys):

@@ -297,7 +297,7 @@ def test_photos_that_come_back_are_waited_for(training, tmp_path, monkeypatch, c
     monkeypatch.setattr(photo_cache.time, "sleep", sleep)
     trainer.train()
     assert waits and "retrying" in " ".join(capsys.readouterr().out.split())
-    assert not trainer.pipeline.datamanager._left_out
+    assert not trainer.pipeline.datamanager.data._left_out
 
 
 def test_a_photo_that_is_damaged_is_not_waited_for(training, monkeypatch):
@@ -305,7 +305,7 @@ def test_a_photo_that_is_damaged_is_not_waited_for(training, monkeypatch):
     shutil.copy(__file__, photos / "photo_001.jpg")
     monkeypatch.setattr(photo_cache.time, "sleep", lambda _: pytest.fail("waited"))
     trainer.train()
-    assert len(trainer.pipeline.datamanager._left_out) == 1
+    assert len(trainer.pipeline.datamanager.data._left_out) == 1
 
 
 # ── masks ───────────────────────────────────────────────────────────────────────────────────────────────

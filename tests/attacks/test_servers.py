@@ -239,3 +239,14 @@ def test_a_taken_port_is_a_sentence_and_a_free_one_is_found(page, monkeypatch):
     for host, port in (("203.0.113.7", None), ("127.0.0.1", 70_000), ("no such host.invalid", 0)):
         with pytest.raises(UserError, match="choose another"):
             PageServer(page.page, host, port)
+
+
+def test_the_body_of_a_get_is_no_second_request(page):
+    """A proxy would take its answer for that to somebody else's request."""
+    second = "GET /scene.json HTTP/1.1\nHost: 127.0.0.1:{port}\n"
+    for length in ("Content-Length: 70", "Transfer-Encoding: chunked"):
+        with socket.create_connection(("127.0.0.1", page.port), timeout=30) as raw:
+            first = f"GET /page.css HTTP/1.1\nHost: 127.0.0.1:{{port}}\n{length}\n\n{second}\n"
+            raw.sendall(first.format(port=page.port).replace("\n", "\r\n").encode())
+            answers = b"".join(iter(lambda: raw.recv(1 << 16), b""))
+        assert answers.count(b"HTTP/1.1 ") == 1 and answers.startswith(b"HTTP/1.1 200")

@@ -51,7 +51,7 @@ def test_a_sound_scene_passes_and_one_without_points_is_told(folder, capsys):
         {"transform_matrix": [[0.0] * 4] * 4},
         {"transform_matrix": POSE[:2]},
         {"transform_matrix": None},
-        *({"fl_x": value} for value in (-50.0, 0, math.nan, "50", None, 10**400)),
+        *({"fl_x": value} for value in (-50.0, 0, math.nan, "50", 10**400)),
         *({"w": value} for value in (0, -40, math.nan, 10**7, "a", True)),
         {"k1": math.nan},
         {"file_path": None},
@@ -59,13 +59,22 @@ def test_a_sound_scene_passes_and_one_without_points_is_told(folder, capsys):
         {"transform_matrix": [[2.0, 0, 0, 0], *POSE[1:]]},
         {"transform_matrix": [[-1.0, 0, 0, 0], *POSE[1:]]},
         {"transform_matrix": [list(row) for row in zip(*POSE, strict=True)]},
-        {"camera_angle_x": 4.0, "fl_x": None},
         {"distortion_params": [0, 0, 0, 0, "a", 0]},
     ],
 )
 def test_frames_that_nothing_can_be_rendered_from_are_named(folder, frame):
     with pytest.raises(UserError, match=r"transforms\.json can't be used"):
         open_capture(write(folder, **frame))
+
+
+def test_null_is_no_value(folder):
+    """Capture apps write null for what they don't know."""
+    (photo,) = open_capture(write(folder, fl_x=None, mask_path=None, camera_model=None)).photos
+    assert (photo.lens.fx, photo.lens.fy) == (50.0, 51.0)
+    with pytest.raises(UserError, match="has no 'fl_x or camera_angle_x'"):
+        open_capture(write(folder, top={"fl_x": None, "fl_y": None}))
+    with pytest.raises(UserError, match=r"its camera_angle_x is 4\.0"):
+        open_capture(write(folder, top={"fl_x": None, "fl_y": None}, camera_angle_x=4.0))
 
 
 @pytest.mark.parametrize("key", ["file_path", "mask_path"])

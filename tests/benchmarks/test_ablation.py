@@ -310,10 +310,10 @@ def test_the_command_trains_scores_and_reports(tmp_path, capsys):
 
 @pytest.mark.nerfstudio
 def test_labels_of_held_out_photos_alone_are_enough(tmp_path):
-    photos = [SimpleNamespace(name="a.jpg"), SimpleNamespace(name="b.jpg")]
+    capture = SimpleNamespace(folder=tmp_path, split=SimpleNamespace(train=("a.jpg", "b.jpg")))
     pipeline = SimpleNamespace(
         evaluation=SimpleNamespace(scorer=SimpleNamespace(truth=SimpleNamespace(key=lambda name: None))),
-        datamanager=SimpleNamespace(train_dataset=SimpleNamespace(photos=photos), data_folder=tmp_path),
+        datamanager=SimpleNamespace(data=SimpleNamespace(capture=capture)),
     )
     assert _beside(pipeline) == {}
 

@@ -2,26 +2,42 @@
 
 import json
 import signal
+from dataclasses import replace
 from functools import partial
 
 import pytest
+import torch
 
 from lab.landmark import scene_writer
 from lab.landmark.demo import Demo
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.training.checkpoint import CHECKPOINT
+from lang3dxl_ns.training.fit import Run
 
-pytestmark = [pytest.mark.slow, pytest.mark.nerfstudio]
-
+pytestmark = pytest.mark.slow
 
 SCENE = {"photos": 8, "test_views": 3, "quick": True, "wild": False}
-FEW = "--pipeline.model.decoder.compression.steps 40 --pipeline.model.semantic-field.code-dim 3"
-"""Learning codes from photos takes 15 seconds otherwise, whatever the number of iterations."""
+
+
+@pytest.fixture(scope="module", autouse=True)
+def few_steps_of_words():
+    """Learning codes from photos takes 15 seconds otherwise, whatever the number of iterations."""
+    settings = Demo.settings
+
+    def fewer(self, out):
+        found = settings(self, out)
+        found.scene.decoder.compression.steps, found.scene.semantic_field.code_dim = 40, 3
+        return found
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Demo, "settings", fewer)
+        yield
 
 
 @pytest.fixture(scope="module")
 def demo(tiny_clip, tiny_dense, tmp_path_factory):
     out = tmp_path_factory.mktemp("demo")
-    settings = Demo(out=out, clip=str(tiny_clip), dense=str(tiny_dense), steps=6, ns_train=FEW, **SCENE)
+    settings = Demo(out=out, clip=str(tiny_clip), dense=str(tiny_dense), steps=6, **SCENE)
     with pytest.MonkeyPatch.context() as patch:
         small = partial(scene_writer.DemoScene, width=240, height=180)
         patch.setattr(scene_writer, "DemoScene", small)
@@ -29,12 +45,8 @@ def demo(tiny_clip, tiny_dense, tmp_path_factory):
     return settings
 
 
-@pytest.fixture
-def run(demo):
-    return demo.out / "run" / "lang3dxl" / "demo"
-
-
-def test_the_report_holds_precision_quality_time_and_memory(run):
+def test_the_report_holds_precision_quality_time_and_memory(demo):
+    run = demo.out
     report = json.loads((run / "report.json").read_text())
     assert [split["protocol"]["photos"] for split in report["splits"].values()] == [3, 1]
     for split in report["splits"].values():
@@ -52,16 +64,13 @@ def test_the_report_holds_precision_quality_time_and_memory(run):
     assert (run / "report.png").stat().st_size > 10_000
 
 
-def test_the_same_command_does_nothing_twice_but_goes_on_when_asked_for_more(demo, run):
-    checkpoint = run / "nerfstudio_models" / "step-000000005.ckpt"
-    written = checkpoint.stat().st_mtime_ns
-    photo = (demo.out / "scene" / "images" / "0001.jpg").stat().st_mtime_ns
+def test_the_same_command_does_nothing_twice_and_another_length_is_another_run(demo):
+    files = [demo.out / CHECKPOINT, demo.out / "scene.scene", demo.out / "scene" / "images" / "0001.jpg"]
+    written = [path.stat().st_mtime_ns for path in files]
     demo.main()
-    assert checkpoint.stat().st_mtime_ns == written
-    demo.steps = 8
-    demo.main()
-    assert (run / "nerfstudio_models" / "step-000000007.ckpt").exists()
-    assert (demo.out / "scene" / "images" / "0001.jpg").stat().st_mtime_ns == photo
+    assert [path.stat().st_mtime_ns for path in files] == written
+    with pytest.raises(UserError, match="another steps: give its options to go on"):
+        replace(demo, steps=8).main()
 
 
 def test_another_scene_in_the_same_folder_is_refused(demo):
@@ -72,32 +81,30 @@ def test_another_scene_in_the_same_folder_is_refused(demo):
 def test_flags_of_training_reach_it_and_a_scene_that_exists_is_not_made_again(demo, tmp_path, monkeypatch):
     monkeypatch.setattr("lab.landmark.scene_writer.write_scene", lambda _: pytest.fail("another scene"))
     (tmp_path / "scene").symlink_to(demo.out / "scene")
-    settings = Demo(out=tmp_path, steps=2, clip="none", dense="none", **SCENE)
-    settings.ns_train = "--pipeline.model.sky-gaussians 0"
+    settings = Demo(out=tmp_path, steps=2, clip="none", dense="none", train="--sky-gaussians 70", **SCENE)
     settings.main()
-    report = json.loads((tmp_path / "run" / "lang3dxl" / "demo" / "report.json").read_text())
-    for split in report["splits"].values():
+    before = json.loads((tmp_path / "report.json").read_text())
+    for split in before["splits"].values():
         assert {"psnr", "cc_psnr", "ssim"} <= set(split)
         assert not {"map", "half_psnr", "clip_l1"} & set(split)
+    replace(settings, train="--sky-gaussians 0", restart=True).main()
+    assert json.loads((tmp_path / "report.json").read_text())["gaussians"] == before["gaussians"] - 70
 
 
 def test_ctrl_c_while_training_keeps_the_run(demo, tmp_path, monkeypatch):
-    from lang3dxl_ns.plugin.model import Lang3DXLModel
-
     (tmp_path / "scene").symlink_to(demo.out / "scene")
-    original = Lang3DXLModel.get_loss_dict
+    original = Run.iterate
 
-    def interrupted(self, *args):
-        if self.step == 3:
+    def interrupted(self, step):
+        if step == 3:
             signal.raise_signal(signal.SIGINT)
-        return original(self, *args)
+        original(self, step)
 
-    monkeypatch.setattr(Lang3DXLModel, "get_loss_dict", interrupted)
-    settings = Demo(out=tmp_path, steps=6, clip=demo.clip, dense=demo.dense, ns_train=FEW, **SCENE)
+    monkeypatch.setattr(Run, "iterate", interrupted)
+    settings = Demo(out=tmp_path, steps=6, clip=demo.clip, dense=demo.dense, **SCENE)
     with pytest.raises(SystemExit, match="same command continues"):
         settings.main()
-    checkpoints = tmp_path / "run" / "lang3dxl" / "demo" / "nerfstudio_models"
-    assert [path.name for path in checkpoints.glob("*")] == ["step-000000003.ckpt"]
+    assert torch.load(tmp_path / CHECKPOINT, weights_only=True)["step"] == 3
     monkeypatch.undo()
     settings.main()
-    assert [path.name for path in checkpoints.glob("*")] == ["step-000000005.ckpt"]
+    assert torch.load(tmp_path / CHECKPOINT, weights_only=True)["words"]

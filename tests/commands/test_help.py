@@ -6,6 +6,7 @@ import re
 import subprocess
 import sys
 from dataclasses import dataclass
+from pathlib import Path
 from typing import get_args
 
 import pytest
@@ -39,6 +40,23 @@ def test_what_few_need_is_left_out_of_the_help_alone(monkeypatch):
         assert options(settings()) == {"--often", "--rarely"}
     assert tyro.cli(settings(), args=["--rarely", "3"]).rarely == 3
     assert asked_for_all(["demo", "--help-all"]) == ["demo", "--help"]
+
+
+def test_the_help_has_the_settings_in_order_and_names_their_kind_alone(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["lang3dxl", "train", "--help"])
+
+    @showing("out", "often")
+    @dataclass
+    class Ordered:
+        often: int = 1
+        rarely: int = 2
+        out: Path | None = None
+
+    with contextlib.suppress(SystemExit):
+        tyro.cli(Ordered, args=["--help"])
+    said = capsys.readouterr().out
+    assert "--out PATH" in said and "None" not in said and "rarely" not in said
+    assert said.index("--out") < said.index("--often")
 
 
 def count() -> None:

@@ -32,6 +32,18 @@ def test_labels_are_written_to_a_json_file_alone(run, tmp_path, name):
     assert (tmp_path / "wall.scene").read_text() == "a scene" and not (tmp_path / "o").exists()
 
 
+def test_labels_replace_labels_alone(run, tmp_path):
+    words = ("query", "c", "--text", "dome", "--all", "--out", tmp_path / "o", "--coco", tmp_path / "a.json")
+    for content in ('{"name": "my package"}', "[]", "no JSON"):
+        (tmp_path / "a.json").write_text(content)
+        with pytest.raises(SystemExit, match="is another file than one of labels"):
+            run(*words)
+        assert (tmp_path / "a.json").read_text() == content
+    (tmp_path / "a.json").write_text('{"images": [], "annotations": []}')
+    run(*words)
+    assert len(json.loads((tmp_path / "a.json").read_text())["images"]) == len(painted_scene().photos)
+
+
 def test_query_writes_pictures_map_and_report(run, tmp_path, capsys):
     words = ("query", "c", "--text", 'dome not "window"', "--text", "window;oculus")
     run(*words, "--image", "all/0003.jpg", "--out", tmp_path)

@@ -44,7 +44,7 @@ def stop(place: str, function: str, number: signal.Signals, arguments: list[str]
 def test_a_stopped_preparation_keeps_its_photos_and_goes_on(scene, tiny_clip, tmp_path, capsys, number):
     arguments = ["prepare", "--data", str(scene), "--cache-dir", str(tmp_path), "--clip", str(tiny_clip)]
     arguments += ["--dense", "none", "--crops", "pyramid"]
-    stop("lang3dxl_ns.preparation.prepare", "build_clip_target", number, arguments)
+    stop("lang3dxl_ns.preparation.kinds", "build_clip_target", number, arguments)
     kept = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.safetensors")}
     assert len(kept) == 2
     cli.main(arguments)

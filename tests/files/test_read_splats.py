@@ -513,6 +513,17 @@ def test_rows_of_zeros_are_invisible(share, tmp_path):
 
 
 HEAD = "ply\nformat ascii 1.0\nelement vertex 1\nproperty {} x\nend_header\n1\n"
+TEN = HEAD.replace(
+    "property {} x\n",
+    "".join(
+        f"property float {name}\n"
+        for name in (
+            *("x", "y", "z", "opacity", *(f"{part}_{i}" for part in ("f_dc", "scale") for i in range(3))),
+            *(f"rot_{i}" for i in range(4)),
+            *(f"f_rest_{i}" for i in range(10)),
+        )
+    ),
+).replace("\n1\n", "\n" + "1 " * 24)
 SPZ = struct.Struct("<IIIBBBB")
 
 
@@ -523,6 +534,8 @@ SPZ = struct.Struct("<IIIBBBB")
         ("a.spz", gzip.compress(SPZ.pack(0x5053474E, 3, 1, 7, 12, 0, 0)), "have degree 7; 0 to 4 can be"),
         ("a.ply", HEAD.format("quark").encode(), "column x has the type quark"),
         ("a.ply", HEAD.format("float").encode(), "no y, z, opacity"),
+        ("a.ply", TEN.encode(), "has 10 columns f_rest, not 9, 24, 45 or 72"),
+        ("a.sog", b"PK", r"SuperSplat makes a \.ply of others"),
     ],
 )
 def test_a_refusal_names_version_degree_type_or_column(name, content, said, tmp_path):

@@ -36,7 +36,7 @@ def lit(scene, tiny_clip, tiny_dense, tmp_path_factory):
 def step_camera(trainer, index=0):
     """Camera and batch of a training photo, from the data manager."""
     datamanager = trainer.pipeline.datamanager
-    datamanager.train_unseen_cameras.insert(0, index)
+    datamanager.data._upcoming.insert(0, index)
     return datamanager.next_train(0)
 
 

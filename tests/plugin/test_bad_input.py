@@ -94,7 +94,7 @@ def test_truncated_photo_does_not_end_the_run(start, folder, capsys, semantics):
     assert photo.name in capsys.readouterr().out
     dataset = trainer.pipeline.datamanager.train_dataset
     index = [p.name for p in dataset.photos].index(photo.name)
-    assert trainer.pipeline.datamanager._left_out == {index}
+    assert trainer.pipeline.datamanager.data._left_out == {index}
     camera = dataset.cameras[index]  # ns-render draws its view
     assert dataset.get_data(index)["image"].shape == (int(camera.height), int(camera.width), 3)
     assert f"{photo.name} is shown black" in " ".join(capsys.readouterr().out.split())

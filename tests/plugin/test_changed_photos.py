@@ -59,7 +59,8 @@ def test_features_are_gathered_at_the_cameras_that_training_refined(train, tmp_p
     data = write_scene(tmp_path / "scene", photos=4, points=60)
     pipeline = train(data, 2, semantics=False, pipeline__model__camera_optimization="on").pipeline
     model = pipeline.model.train()
-    camera, _ = next(iter(pipeline.datamanager.train_photos()))
+    data = pipeline.datamanager
+    camera, _ = next(data.read(data.data.capture.split.train))
     places = model.means.detach()
     before = model.composite(camera, places)
     with torch.no_grad():
@@ -73,7 +74,8 @@ def test_features_are_gathered_at_the_cameras_that_training_refined(train, tmp_p
 def test_scenes_and_runs_record_the_cameras_that_training_refined(train, tmp_path):
     data = write_scene(tmp_path / "scene", photos=4, points=60)
     trainer = train(data, 2, semantics=False, pipeline__model__camera_optimization="on")
-    model, photos = trainer.pipeline.model, trainer.pipeline.datamanager.train_photos()
+    model, manager = trainer.pipeline.model, trainer.pipeline.datamanager
+    photos = manager.read(manager.data.capture.split.train)
     with torch.no_grad():
         model.camera_optimizer.pose_adjustment[:] = 0.1 * torch.rand(3, 6)
     trainer.write_scene()
@@ -143,7 +145,7 @@ def test_a_target_that_vanishes_does_not_end_the_learning_of_words(train, tmp_pa
     begin = Lang3DXLTrainer.train
 
     def without_one(self):
-        targets = self.pipeline.datamanager.targets
+        targets = self.pipeline.datamanager.data.targets
         name = self.pipeline.datamanager.train_dataset.photos[0].name
         targets._store.path("dense", name).unlink()
         begin(self)

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.plugin.datamanager import Lang3DXLDataManagerConfig
 from lang3dxl_ns.plugin.dataparser import PhotoCollectionDataParserConfig, parser_for
-from lang3dxl_ns.scene.capture import images_path
+from lang3dxl_ns.scene.layout import images_folder
 from lang3dxl_ns.scene.photo_folder import _sharpest, extract_frames
 
 needs_ffmpeg = pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="ffmpeg is not installed")
@@ -48,11 +48,11 @@ def test_a_flat_folder_of_photos_is_all_that_training_needs(walk, tmp_path):
     data = shutil.copytree(walk, tmp_path / "data")
     before = {path.name: path.stat().st_mtime_ns for path in data.iterdir()}
     manager = datamanager(data)
-    assert len(manager.photos) == 8
+    assert len(manager.data.photos) == 8
     assert {name: (data / name).stat().st_mtime_ns for name in before} == before
     assert {path.name for path in data.iterdir()} - set(before) == {"sparse", "lang3dxl_cache"}
     again = datamanager(data)  # finds the model, and the photos beside it
-    assert list(again.photos) == list(manager.photos)
+    assert list(again.data.photos) == list(manager.data.photos)
     assert (
         again.train_dataset.cameras.camera_to_worlds == manager.train_dataset.cameras.camera_to_worlds
     ).all()
@@ -63,7 +63,7 @@ def test_sub_folders_of_photos_are_read_with_their_model(walk, tmp_path):
         (tmp_path / "data" / f"day{i % 2}").mkdir(parents=True, exist_ok=True)
         shutil.copy(path, tmp_path / "data" / f"day{i % 2}" / path.name)
     manager = datamanager(tmp_path / "data")
-    assert {name.split("/")[0] for name in manager.photos} == {"day0", "day1"}
+    assert {name.split("/")[0] for name in manager.data.photos} == {"day0", "day1"}
 
 
 def test_a_run_whose_model_is_gone_gets_no_other_one(walk, tmp_path):
@@ -182,7 +182,7 @@ def test_an_empty_images_folder_does_not_hide_the_photos(walk, tmp_path):
     data = shutil.copytree(walk, tmp_path / "data")
     (data / "images").mkdir()
     (data / "images" / ".DS_Store").touch()
-    assert images_path(data) == Path(".")
+    assert images_folder(data, data / "sparse" / "0") == data
 
 
 @needs_ffmpeg

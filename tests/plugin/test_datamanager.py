@@ -2,6 +2,7 @@
 
 import shutil
 import threading
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,14 +11,18 @@ import torch
 from PIL import Image, ImageOps
 
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.plugin.datamanager import Lang3DXLDataManager
 from lang3dxl_ns.plugin.dataparser import PhotoCollectionDataParserConfig
 from lang3dxl_ns.plugin.photo_dataset import PhotoDataset
 from lang3dxl_ns.preparation import photo_cache
 from lang3dxl_ns.preparation.photo_cache import PhotoCache
+from lang3dxl_ns.preparation.settings import PreparationConfig
 from lang3dxl_ns.preparation.store import FeatureStore
 from lang3dxl_ns.preparation.working_photos import WorkingPhotos
-from lang3dxl_ns.scene.camera import view_matrix
+from lang3dxl_ns.scene.camera import Lens, view_matrix
+from lang3dxl_ns.scene.capture import Capture, Split
+from lang3dxl_ns.scene.colmap import Reconstruction, TrackedPhoto
+from lang3dxl_ns.scene.photo import Photo
+from lang3dxl_ns.training.batches import TrainingData
 from lang3dxl_ns.training.gaussians import sphere_around
 
 
@@ -139,26 +144,20 @@ def test_sky_surrounds_the_scene_evenly():
     assert float((sky.mean(dim=0) - points.median(dim=0).values).norm() / radii.mean()) < 1e-2
 
 
-def test_thousands_of_unusable_photos_in_a_row_are_passed_over():
+def test_thousands_of_unusable_photos_in_a_row_are_passed_over(monkeypatch):
     """More than Python's stack holds calls."""
-    count = 3_000
+    names = tuple(str(i) for i in range(3_000))
 
     def read(index, _ahead):
-        if index != count - 1:
+        if index != len(names) - 1:
             raise UserError("it is damaged")
         return {}
 
-    manager = object.__new__(Lang3DXLDataManager)
-    photos = [SimpleNamespace(name=str(i)) for i in range(count)]
-    vars(manager).update(
-        train_unseen_cameras=list(range(count)),
-        train_dataset=SimpleNamespace(photos=photos, __len__=lambda: count),
-        config=SimpleNamespace(read_ahead=0),
-        _train_cache=SimpleNamespace(get=read),
-        _left_out=set(),
-        _gone=0,
-        _batch=lambda _dataset, index, _data: (SimpleNamespace(), {"name": str(index)}),
-        _leave_out=lambda *_: None,
-        sample_train_cameras=lambda: [count - 1],
-    )
-    assert manager.next_train(0)[1]["name"] == str(count - 1)
+    lens, nothing = Lens(4, 4, 4.0, 4.0, 2.0, 2.0), np.zeros((0, 3))
+    photos = [Photo(name, Path(name), None, lens) for name in names]
+    seen = {name: TrackedPhoto(name, lens, np.eye(4)[:3], nothing, nothing[:, :2]) for name in names}
+    capture = Capture(Path(), photos, Reconstruction(seen, nothing, nothing), known_split=Split(names, names))
+    data = TrainingData(capture, PreparationConfig(), Path(), "cpu", False)
+    data._cache = SimpleNamespace(get=read)
+    monkeypatch.setattr(TrainingData, "_leave_out", lambda *_: None)
+    assert data.next()[1]["name"] == names[-1]

@@ -11,6 +11,9 @@ from lab.baselines import BASELINES, langsplat
 from lang3dxl_ns.components.compression import CompressionConfig
 from lang3dxl_ns.components.decoders import DecoderConfig
 from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
+from lang3dxl_ns.evaluation.score_run import score_features
+from lang3dxl_ns.plugin.cameras import to_rasterizer
+from lang3dxl_ns.training.snapshot import snapshot
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +51,9 @@ def test_a_decoder_trains_gives_features_of_the_targets_width_and_is_the_same_on
     _, images = model.get_image_metrics_and_images(model.get_outputs_for_camera(camera), batch)
     assert model.semantic_field.decode_clip(model.carried).shape[-1] == batch["clip_target"].shape[-1]
     assert images["bottleneck"].shape[-1] == 3
-    metrics = model.feature_metrics(camera, batch)
+    run, data = model.run, trainer.pipeline.datamanager.data
+    side, view = model.config.decode_size[1], to_rasterizer(camera)
+    metrics = score_features(snapshot(run, data.record()), run.parts.semantics, view, batch, side)
     without_dense = name in ("langsplat", "gathered", "lifting")
     assert metrics["clip_l1"] < 10 and ("dense_l1" in metrics) is not without_dense
     _, pipeline, _, _ = eval_setup(trainer.base_dir / "config.yml", test_mode="inference")
@@ -81,7 +86,7 @@ def test_gathered_features_come_near_the_targets_and_nothing_is_learned_before(r
     assert set(trainer.pipeline.last_losses) == {"rgb"}
     datamanager = trainer.pipeline.datamanager
     assert set(datamanager.next_train(0)[1]) == {"image", "image_idx", "name"}  # no step waits for a target
-    assert {"clip_target", "dense_target"} < set(next(datamanager.train_photos())[1])
+    assert {"clip_target", "dense_target"} < set(next(datamanager.data.every_photo())[1])
     assert not any("dense_target" in batch for _, batch in datamanager.fixed_indices_eval_dataloader)
     metrics = trainer.pipeline.get_average_eval_image_metrics()
     assert metrics["clip_l1"] < metrics["clip_l1_of_mean"] * 1.5
@@ -119,5 +124,5 @@ def test_crops_of_one_size_are_the_middle_of_the_range(train, scene, tmp_path):
     options = {"scale_mode": "relative", "scale_range": (0.4, 0.9), "scales": 1}
     options |= {"cache_dir": tmp_path / "targets", "crops": "pyramid"}
     trainer = train(scene, iterations=2, **{f"pipeline__datamanager__{k}": v for k, v in options.items()})
-    _, batch = next(trainer.pipeline.datamanager.train_photos())
+    _, batch = next(trainer.pipeline.datamanager.data.every_photo())
     assert batch["crop_sides"] == [pytest.approx(0.6, abs=0.02)]

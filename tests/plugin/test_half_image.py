@@ -8,7 +8,7 @@ from looks import in_look
 from lang3dxl_ns.components.appearance import Look
 from lang3dxl_ns.components.losses import rgb_loss
 from lang3dxl_ns.evaluation.half_image import HalfImageProtocol
-from lang3dxl_ns.evaluation.photo_metrics import psnr
+from lang3dxl_ns.evaluation.photo_metrics import corrected_psnr, psnr
 from lang3dxl_ns.plugin.cameras import to_rasterizer
 
 USE = "pipeline__model__appearance__use"
@@ -99,8 +99,8 @@ def test_what_a_photo_does_not_reach_is_not_scored(pipeline, photo, monkeypatch)
     assert expected > float(psnr(outputs["rgb"], model.get_gt_img(cornered["image"]))) + 1
     metrics, _ = model.get_image_metrics_and_images(outputs, cornered)
     assert metrics["psnr"] == pytest.approx(expected, abs=1e-3)
-    rest = {"rgb": outputs["rgb"][cut:]}, {"image": batch["image"][cut:]}
-    assert model.corrected_psnr(outputs, cornered) == pytest.approx(model.corrected_psnr(*rest), abs=1e-2)
+    rest, target, mask = (outputs["rgb"][cut:], rows), cornered["image"] / 255, cornered["mask"][..., 0]
+    assert corrected_psnr(outputs["rgb"], target, mask) == pytest.approx(corrected_psnr(*rest), abs=1e-2)
     rendering, figures = half_image(model, camera, cornered)
     right = [halves(picture)[1] for picture in (rendering[cut:], rows)]
     assert figures["half_psnr"] == pytest.approx(float(psnr(*right)), abs=1e-3)

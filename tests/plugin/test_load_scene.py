@@ -133,7 +133,7 @@ def test_cameras_are_those_that_were_trained_with(scene, trainer):
 
 def test_the_files_frame_leads_back_to_colmaps(scene, trainer):
     """scale · (transform · COLMAP's camera center) is the camera's center in the model."""
-    reconstruction = trainer.pipeline.datamanager.reconstruction
+    reconstruction = trainer.pipeline.datamanager.data.capture.reconstruction
     transform = torch.tensor(scene.file.transform, dtype=torch.float64)
     for photo in scene.file.photos:
         pose = torch.from_numpy(reconstruction.photos[photo.name].camera_from_world)
@@ -146,9 +146,8 @@ def test_the_files_frame_leads_back_to_colmaps(scene, trainer):
 def test_a_query_is_what_evaluation_scores(scene, trainer, tiny_clip):
     """The same words, vectors and formula as ns-eval's average precision, at the size of training."""
     scorer = open_scorer(SimpleNamespace(categories=["dome", "door"]), str(tiny_clip), "cpu")
-    pipeline, camera = trainer.pipeline, scene.camera("photo_003.jpg", size=scene.trained_side)
-    pipeline.eval()
-    maps = pipeline.evaluation.relevancy(view_of(camera), scorer.queries, scorer.yardstick)
+    model, camera = trainer.pipeline.model, scene.camera("photo_003.jpg", size=scene.trained_side)
+    maps = model.scene(scene.file).relevancy_maps(camera, scorer.queries)
     for match, expected in zip(scene.query("dome; door", camera), maps, strict=True):
         seen = match.view.alpha >= scene.config.min_alpha
         np.testing.assert_allclose(match.relevancy[seen], expected.numpy()[seen], rtol=1e-5, atol=1e-6)
@@ -199,7 +198,7 @@ def test_another_clip_is_refused(trainer):
 
 
 def test_a_run_remembers_its_foreground_masks(trainer, scene):
-    photos = trainer.pipeline.datamanager.photos
+    photos = trainer.pipeline.datamanager.data.photos
     assert {photo.name for photo in scene.file.photos if photo.mask} == {"photo_001.jpg"}
     photo = scene.file.photo("photo_001")
     assert photo.mask == str(photos["photo_001.jpg"].mask_path)

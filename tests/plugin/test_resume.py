@@ -13,6 +13,7 @@ from lang3dxl_ns.open_scene import load_scene
 from lang3dxl_ns.plugin.pipeline import Lang3DXLPipeline
 from lang3dxl_ns.plugin.trainer import Lang3DXLTrainer
 from lang3dxl_ns.scene.record import SCENE_FILE, SceneRecord
+from lang3dxl_ns.training import batches
 
 EVERYTHING = {
     "pipeline__model__decoder__name": "paper",
@@ -94,28 +95,29 @@ def test_a_run_of_another_scene_is_not_resumed(train, scene, whole, tmp_path):
 
 def test_a_damaged_photo_does_not_change_the_order_of_the_others(train, scene, whole, monkeypatch):
     """A resumed run meets it later, but continues with the same order of photos."""
-    datamanager = whole.pipeline.datamanager
-    make = type(datamanager)._batch
+    data, read = whole.pipeline.datamanager.data, batches.read_data
+    broken = data.capture.split.train[2]
 
-    def damaged(self, dataset, index, data):
-        if index == 2:
+    def damaged(photo, *how):
+        if photo.name == broken:
             raise UserError("cannot be read")
-        return make(self, dataset, index, data)
+        return read(photo, *how)
 
-    monkeypatch.setattr(type(datamanager), "_batch", damaged)
-    state = datamanager.round_state()
+    monkeypatch.setattr(batches, "read_data", damaged)
+    monkeypatch.setattr(data._cache, "_kept", {})
+    state = data.state()
 
     def names(count: int) -> list[str]:
-        return [datamanager.next_train(0)[1]["name"] for _ in range(count)]
+        return [data.next()[1]["name"] for _ in range(count)]
 
     started = names(5)
-    middle = datamanager.round_state()
+    middle = data.state()
     whole_order = started + names(40)
-    datamanager._left_out.clear()
-    datamanager.restore_round(middle)
+    data._left_out.clear()
+    data.restore(middle)
     assert started + names(40) == whole_order
-    datamanager._left_out.clear()
-    datamanager.restore_round(state)
+    data._left_out.clear()
+    data.restore(state)
 
 
 FROM_PHOTOS = EVERYTHING | {"pipeline__model__codes_from": "photos", "pipeline__model__warm_up": 0.4}

@@ -6,7 +6,7 @@ import pytest
 import torch
 from scenes import write_scene
 
-from lang3dxl_ns.plugin.datamanager import Lang3DXLDataManager
+from lang3dxl_ns.training import batches
 
 QUIET = {"steps_per_eval_image": 0}
 
@@ -56,16 +56,16 @@ def spoil(monkeypatch):
     """Changes the batches of photos by name; None: of all of them."""
 
     def install(changes):
-        make = Lang3DXLDataManager._batch
+        make = batches.to_batch
 
-        def spoilt(self, dataset, index, data):
-            camera, batch = make(self, dataset, index, data)
-            change = changes.get(batch["name"], changes.get(None))
+        def spoilt(data, name, *how):
+            batch = make(data, name, *how)
+            change = changes.get(name, changes.get(None))
             if change is not None:
                 change(batch)
-            return camera, batch
+            return batch
 
-        monkeypatch.setattr(Lang3DXLDataManager, "_batch", spoilt)
+        monkeypatch.setattr(batches, "to_batch", spoilt)
 
     return install
 

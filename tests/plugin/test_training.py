@@ -211,7 +211,7 @@ def test_the_mask_bounds_the_region_loss_and_as_published_not_the_dense_one(trai
         scene, iterations=2, **{f"pipeline__datamanager__{name}": value for name, value in options.items()}
     )
     batch, model, outputs = first_batch(trainer)
-    photo = trainer.pipeline.datamanager.photos[batch["name"]]
+    photo = trainer.pipeline.datamanager.data.photos[batch["name"]]
     assert torch.equal(photo.read_mask(), batch["mask"][..., 0])
     assert 0.4 < batch["mask"].float().mean() < 0.6
     before = model.get_loss_dict(outputs, batch)

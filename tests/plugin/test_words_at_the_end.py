@@ -78,9 +78,7 @@ def test_words_of_a_run_that_is_prolonged_are_learned_anew(trained, train, scene
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_a_signal_while_words_are_learned_ends_the_run_at_once(trained, monkeypatch, number, code):
     run, folders = trained
-    monkeypatch.setattr(
-        "lang3dxl_ns.plugin.model.Lang3DXLModel.learn_from_photos", lambda *_: signal.raise_signal(number)
-    )
+    monkeypatch.setattr("lang3dxl_ns.plugin.pipeline.learn_words", lambda *_: signal.raise_signal(number))
     with pytest.raises(SystemExit) as end:
         run()
     assert end.value.code == code

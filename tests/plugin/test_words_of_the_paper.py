@@ -33,7 +33,12 @@ def test_words_are_found_half_as_well_as_by_the_teacher_and_none_collapses(tmp_p
     )
     trainer.setup()
     trainer.train()
-    found = average([photo.metrics for photo in evaluate_novel_views(trainer.pipeline)])
+    found = average(
+        [
+            photo.metrics
+            for photo in evaluate_novel_views(trainer.pipeline.model.run, trainer.pipeline.datamanager.data)
+        ]
+    )
     assert found["map"] > 3 * found["chance_map"]
     assert found["map"] > 0.5 * found["teacher_map"]
     words = [name.removeprefix("teacher_ap_") for name in found if name.startswith("teacher_ap_")]

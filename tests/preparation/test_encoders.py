@@ -17,7 +17,6 @@ from lang3dxl_ns.preparation.model_files import (
     USUAL_CLIP,
     check_encoders,
     find_model,
-    option_prefix,
     usual_clip,
 )
 
@@ -166,11 +165,9 @@ def test_an_absent_model_is_an_error_that_names_it_and_the_remedy(tmp_path, monk
 
     monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_OFFLINE", True)
     monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_CACHE", str(tmp_path))
-    with pytest.raises(
-        UserError, match=r"some-org/some-clip.*hf download .*--pipeline\.datamanager\.clip DIR"
-    ):
+    with pytest.raises(UserError, match=r"some-org/some-clip.*hf download .*--clip DIR"):
         load_image_text_encoder("some-org/some-clip", "cpu")
-    with pytest.raises(UserError, match=r"--pipeline\.datamanager\.dense DIR"):
+    with pytest.raises(UserError, match=r"--dense DIR"):
         load_dense_encoder("some-org/some-dino", "cpu")
     with pytest.raises(UserError, match="no/such/folder"):
         load_image_text_encoder("/no/such/folder", "cpu")
@@ -250,32 +247,25 @@ CLIP, DINO = "openai/clip-vit-base-patch32", "facebook/dinov2-small"
 
 
 @pytest.mark.parametrize(
-    ("clip", "prefix", "told"),
+    ("clip", "told"),
     [
         (
             CLIP,
-            "--pipeline.datamanager.",
-            r"Either use .*{p}clip builtin\. Or, .*download {c} .*download {d} ",
+            rf"Either use .*: --clip builtin\. .*download {CLIP} .*--clip DIR/\S+ --dense DIR/dinov2-small$",
         ),
-        (CLIP, "--", r"this package: --clip builtin.*use --clip DIR/\S+ --dense DIR/dinov2-small$"),
-        ("builtin", "--pipeline.datamanager.", r"Either do without .*{p}dense none\. Or, .* hf download {d}"),
+        ("builtin", rf"Either do without .*--dense none\. Or, .* hf download {DINO}"),
     ],
 )
-def test_whoever_is_offline_is_told_of_the_missing_encoders_and_of_two_ways_out(clip, prefix, told):
-    """Each command in its own options."""
-    token = option_prefix.set(prefix)
-    try:
-        with pytest.raises(UserError, match=told.format(p=prefix, c=CLIP, d=DINO)):
-            check_encoders(clip, DINO)
-    finally:
-        option_prefix.reset(token)
+def test_whoever_is_offline_is_told_of_the_missing_encoders_and_of_two_ways_out(clip, told):
+    with pytest.raises(UserError, match=told):
+        check_encoders(clip, DINO)
 
 
 def test_an_encoder_that_is_here_is_not_asked_for(tiny_clip):
     with pytest.raises(UserError) as told:
         check_encoders(str(tiny_clip), DINO)
     assert "openai" not in str(told.value)
-    assert "--pipeline.datamanager.clip DIR" not in str(told.value)
+    assert "--clip DIR" not in str(told.value)
 
 
 def test_without_a_download_the_clip_is_the_built_in_one(monkeypatch, tmp_path):

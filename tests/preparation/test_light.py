@@ -7,7 +7,7 @@ import pytest
 import torch
 from PIL import Image
 
-from lang3dxl_ns.preparation import prepare as module
+from lang3dxl_ns.preparation import kinds as module
 from lang3dxl_ns.preparation.encoders import BUILTIN, in_known_light, load_image_text_encoder
 from lang3dxl_ns.preparation.prepare import prepare
 from lang3dxl_ns.preparation.settings import PreparationConfig

@@ -21,6 +21,7 @@ from tiny_models import make_tiny_clip, make_tiny_dinov2
 from lang3dxl_ns.common import console as progress
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.stages import roughly
+from lang3dxl_ns.preparation import kinds
 from lang3dxl_ns.preparation import prepare as module
 from lang3dxl_ns.preparation.dense_map import build_dense_map, map_grids, nested_grids
 from lang3dxl_ns.preparation.encoders import DenseEncoder, ImageTextEncoder, load_image_text_encoder
@@ -77,12 +78,12 @@ def calls(monkeypatch):
 
         monkeypatch.setattr(owner, method, counting)
 
-    count(module, "build_clip_target", "clip")
+    count(kinds, "build_clip_target", "clip")
     count(DenseEncoder, "encode", "dense")
     count(Photo, "read_uint8", "read")
     count(FelzenszwalbRegions, "labels", "regions")
-    count(module, "load_image_text_encoder", "clip loaded")
-    count(module, "load_dense_encoder", "dense loaded")
+    count(kinds, "load_image_text_encoder", "clip loaded")
+    count(kinds, "load_dense_encoder", "dense loaded")
     return counts
 
 

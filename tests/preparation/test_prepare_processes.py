@@ -12,7 +12,7 @@ from processes import Process
 from tiny_models import make_tiny_clip
 from worker_tasks import prepare, write_photo
 
-from lang3dxl_ns.preparation import prepare as preparation
+from lang3dxl_ns.preparation import kinds as preparation
 from lang3dxl_ns.preparation.store import FeatureStore
 
 

@@ -134,13 +134,13 @@ def test_automatic_masks_cover_the_image_at_its_own_size(models, monkeypatch):
 def test_models_of_another_kind_are_refused_with_the_option_to_change(models):
     with pytest.raises(UserError, match=r"dinov2 model.*foreground-model"):
         find_text_segmenter(models["dinov2"], models["sam"])
-    with pytest.raises(UserError, match=r"clipseg model.*datamanager\.sam"):
+    with pytest.raises(UserError, match=r"clipseg model.*--sam"):
         find_text_segmenter(models["grounding"], models["clipseg"])
 
 
 def test_no_segmentation_network_is_built_in(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(UserError, match=r"builtin.*datamanager\.sam"):
+    with pytest.raises(UserError, match=r"builtin.*--sam"):
         find_sam("builtin")
 
 
@@ -149,7 +149,7 @@ def test_offline_the_error_says_how_to_get_the_model(models):
         UserError, match=r"hf download IDEA-Research/grounding-dino-tiny .*foreground-model DIR"
     ):
         find_text_segmenter("IDEA-Research/grounding-dino-tiny", models["sam"])
-    with pytest.raises(UserError, match=r"hf download facebook/sam-vit-base .*datamanager\.sam DIR"):
+    with pytest.raises(UserError, match=r"hf download facebook/sam-vit-base .*--sam DIR"):
         find_text_segmenter(models["grounding"], "facebook/sam-vit-base")
 
 

@@ -1,5 +1,6 @@
 """Laws of photos at working size: the same as from the file, decoded once."""
 
+import errno
 from dataclasses import replace
 
 import numpy as np
@@ -75,3 +76,14 @@ def test_without_room_for_copies_photos_are_read_from_their_files(photo, tmp_pat
     working = WorkingPhotos(FeatureStore(tmp_path / "file" / "store"))
     assert torch.equal(working.mask(photo), photo.read_mask())
     assert working.read(photo).shape == (300, 400, 3)
+
+
+def test_a_full_disk_is_told_once_and_photos_are_read_nonetheless(photo, working, monkeypatch, capsys):
+    def full(path, content):
+        raise OSError(errno.ENOSPC, "no space", str(path))
+
+    monkeypatch.setattr("lang3dxl_ns.preparation.store.replace_file", full)
+    for _ in range(2):
+        assert torch.equal(working.mask(photo), photo.read_mask())
+        assert working.read(photo).shape == photo.read_uint8().shape
+    assert capsys.readouterr().out.count("decoded anew in every round, which is slow: no space left") == 1

@@ -395,3 +395,9 @@ def test_the_cache_is_forgotten_with_the_masks_and_the_way_of_drawing(tmp_path, 
     else:
         antialiased = True
     assert float(scene().mass.sum()) < 0.5 * before
+
+
+def test_an_array_of_texts_is_a_list_of_them():
+    scene = painted_scene()
+    for texts in (np.array(["dome", "windows"]), np.array(["dome", "windows"], object)):
+        assert [p.text for p in scene.prompts(texts)] == ["dome", "windows"]

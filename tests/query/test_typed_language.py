@@ -16,16 +16,26 @@ from lang3dxl_ns.web.write_page import language_module
 READ = """
 import { meaning, parsePrompts } from "./vocabulary.js";
 import cases from "./cases.js";
-console.log(JSON.stringify(cases.map((typed) => parsePrompts(typed).map(({ text, negatives }) => {
+console.log(JSON.stringify(cases.map((case_) => parsePrompts(...case_).map(({ text, negatives }) => {
   const { target, unused } = meaning(text);
   return [text, negatives, target, unused.map(([kind]) => kind)];
 }))));
 """
 
 
-def read(typed: str) -> list:
+NAMES = ("lords and ladies", "do not enter gate", "Mary, Queen (of Scots)")
+"""Names of taught words that hold separators."""
+NAMED = {
+    "windows and lords and ladies": ["windows", "lords and ladies"],
+    "Lords and Ladies, doors": ["Lords and Ladies", "doors"],
+    "do not enter gate; mary, queen (of scots)": ["do not enter gate", "mary, queen (of scots)"],
+    "overlords and ladies": ["overlords", "ladies"],
+}
+
+
+def read(typed: str, names=()) -> list:
     """What Python makes of a text, in the form of the table's cases."""
-    meanings = [(prompt, meaning(prompt.text)) for prompt in parse_prompts(typed)]
+    meanings = [(prompt, meaning(prompt.text)) for prompt in parse_prompts(typed, names)]
     return [[p.text, list(p.negatives), m.target, [kind for kind, _ in m.unused]] for p, m in meanings]
 
 
@@ -34,17 +44,24 @@ def test_what_people_type_is_read_as_meant(typed, expected):
     assert read(typed) == expected
 
 
+@pytest.mark.parametrize(("typed", "expected"), NAMED.items())
+def test_a_name_is_never_split(typed, expected):
+    assert [prompt.text for prompt in parse_prompts(typed, NAMES)] == expected
+    assert not any(prompt.negatives for prompt in parse_prompts(typed, NAMES))
+
+
 @pytest.mark.skipif(shutil.which("node") is None, reason="needs node")
 def test_the_page_reads_the_same(tmp_path):
     for path in Path(web.__file__).parent.glob("*.js"):
         shutil.copy(path, tmp_path)
     (tmp_path / "language.js").write_bytes(language_module())
-    typed = [case[0] for case in TABLE["cases"]] + list(common_words())
+    typed = [(case[0], ()) for case in TABLE["cases"]] + [(word, ()) for word in common_words()]
+    typed += [(text, NAMES) for text in (*NAMED, *(case[0] for case in TABLE["cases"]))]
     (tmp_path / "cases.js").write_text(f"export default {json.dumps(typed)};")
     (tmp_path / "package.json").write_text('{"type": "module"}')
     (tmp_path / "read.mjs").write_text(READ)
     done = subprocess.run(["node", tmp_path / "read.mjs"], capture_output=True, text=True, check=True)
-    assert json.loads(done.stdout) == [read(text) for text in typed]
+    assert json.loads(done.stdout) == [read(*one) for one in typed]
 
 
 def test_every_word_that_is_shipped_is_one_prompt_for_itself():

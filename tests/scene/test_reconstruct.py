@@ -15,7 +15,7 @@ from lang3dxl_ns.common.files import locked
 from lang3dxl_ns.scene import reconstruct as module
 from lang3dxl_ns.scene.colmap import read_reconstruction
 from lang3dxl_ns.scene.photo_folder import find_photos
-from lang3dxl_ns.scene.placements import doubtful_placements, matched_pairs, rotations_of
+from lang3dxl_ns.scene.placements import cameras_of, doubtful_placements, matched_pairs, rotations_of
 from lang3dxl_ns.scene.reconstruct import reconstruct, reconstruct_scene
 from lang3dxl_ns.scene.reconstruction import ReconstructionSettings
 
@@ -75,7 +75,7 @@ def test_what_matches_measure_agrees_with_the_model(reconstructed):
     data, model, _ = reconstructed
     model, database = pycolmap.Reconstruction(model), data / "lang3dxl_cache/reconstruction/database.db"
     db = pycolmap.Database.open(database)
-    pairs = matched_pairs(db, model)
+    pairs = matched_pairs(db, cameras_of(model))
     db.close()
     rotations = rotations_of(model)
     assert len(pairs) > 6 and doubtful_placements(rotations, pairs) == {}

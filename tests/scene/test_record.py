@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import asdict
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.scene.camera import Lens, camera_to_world, posed, resized, view_matrix
 from lang3dxl_ns.scene.camera_path import read_camera_path
 from lang3dxl_ns.scene.photo import Photo, turned_lens
+from lang3dxl_ns.scene.reconstruction import REPORT, ReconstructionReport, doubtful_photos
 from lang3dxl_ns.scene.record import ScenePhoto, SceneRecord
 from lang3dxl_ns.words.learn_word import _marks
 from lang3dxl_ns.words.taught_words import Example
@@ -62,6 +64,17 @@ def test_marks_are_pixels_of_the_file_where_training_read_it_smaller(turns, tmp_
     assert (photo.full_camera.width, photo.full_camera.height) == (width // 2, height // 2)
     marks = _marks(Example("a", box=(width - 6, 0, width, 4)), photo, (height // 2, width // 2))
     assert marks[0, :2, -3:].min() == 1 and marks[0].sum() == 6
+
+
+def test_a_doubtful_place_is_kept_from_the_reconstruction_to_the_record(tmp_path):
+    assert doubtful_photos(tmp_path) == {}
+    report = ReconstructionReport(2, 2, 9, 0.5, 1, "incremental", doubtful={"a": "it looks away"})
+    (tmp_path / REPORT).parent.mkdir()
+    (tmp_path / REPORT).write_text(json.dumps(asdict(report)))
+    pose, photo = torch.eye(4)[:3].tolist(), Photo("a", tmp_path / "a", None, Lens(30, 20, 30, 30, 15, 10))
+    described = ScenePhoto.of(photo, "train", pose, 1.0, doubtful_photos(tmp_path).get("a"))
+    SceneRecord([described], None, None, 1.0, pose, "data").write(tmp_path / "scene.json")
+    assert SceneRecord.read(tmp_path / "scene.json").photos[0].doubtful == "it looks away"
 
 
 def test_a_missing_file_is_explained(tmp_path):

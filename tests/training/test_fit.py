@@ -13,7 +13,7 @@ from lang3dxl_ns.files.scene_file import read_scene
 from lang3dxl_ns.scene.capture import open_capture
 from lang3dxl_ns.training import fit as fitting
 from lang3dxl_ns.training.checkpoint import CHECKPOINT
-from lang3dxl_ns.training.fit import Run, Settings, fit
+from lang3dxl_ns.training.fit import Run, Settings, begin, fit
 
 STEPS = 20
 GROWING = {"densify_grad_thresh": 1e-7, "densify_every": 0.2, "densify_until": 0.75}
@@ -86,6 +86,16 @@ def test_a_run_that_was_stopped_ends_with_the_same_bytes(data, settings, tmp_pat
         trained(data, tmp_path / "again", settings())
     monkeypatch.setattr(Run, "iterate", iterate)
     assert differing(whole, trained(data, tmp_path / "again", settings())) == []
+
+
+def test_a_scene_of_a_resumed_run_has_all_its_colors(data, settings, tmp_path):
+    """Colors by direction come with the iterations, also in a run that is only opened."""
+    made = settings(20, view_dependence="on")
+    capture, cache = open_capture(data), data / "lang3dxl_cache"
+    whole = fit(capture, made, tmp_path, cache, "cpu")
+    again = begin(capture, settings(20, view_dependence="on"), tmp_path, cache, "cpu").scene()
+    assert whole.splats.degree == again.splats.degree == 3
+    assert torch.equal(whole.splats.harmonics, again.splats.harmonics)
 
 
 def test_a_finished_run_is_not_trained_again_and_another_one_is_refused(

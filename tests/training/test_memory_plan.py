@@ -32,7 +32,7 @@ def test_words_looks_and_pixels_take_memory(model, monkeypatch):
     most = cap(model, 8e9, monkeypatch)
     assert cap(model, 8e9, monkeypatch, pixels=12_000_000) < most
     run = model.run
-    run.parts = replace(run.parts, appearance=model.ssim)
+    run.parts = replace(run.parts, appearance=torch.nn.Linear(2, 2))
     assert cap(model, 8e9, monkeypatch) < most
     run.parts = replace(run.parts, appearance=None, semantics=None)
     assert cap(model, 8e9, monkeypatch) > most

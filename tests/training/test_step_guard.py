@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.training import batches
 from lang3dxl_ns.training.step_guard import StepGuard
 
 
@@ -64,17 +65,15 @@ CODES = {"pipeline__model__decoder__name": "paper"}
 
 def spoil(monkeypatch, key: str, value: float, photos: set[str]) -> None:
     """Give the batches of these photos (empty: of all) a broken tensor."""
-    from lang3dxl_ns.plugin.datamanager import Lang3DXLDataManager
+    make = batches.to_batch
 
-    make = Lang3DXLDataManager._batch
-
-    def spoiled(self, dataset, index, data):
-        camera, batch = make(self, dataset, index, data)
-        if batch["name"] in photos or not photos:
+    def spoiled(data, name, *how):
+        batch = make(data, name, *how)
+        if name in photos or not photos:
             batch[key] = torch.full(batch[key].shape, value)
-        return camera, batch
+        return batch
 
-    monkeypatch.setattr(Lang3DXLDataManager, "_batch", spoiled)
+    monkeypatch.setattr(batches, "to_batch", spoiled)
 
 
 @pytest.mark.parametrize("key", ["image", "clip_target"])

@@ -298,3 +298,16 @@ def test_what_is_large_and_floats_before_the_wall_is_hidden_and_left_out(tmp_pat
     np.testing.assert_array_equal(packed > 255 * FLOATS, floats.numpy())
     count = scene.export(tmp_path / "scene.ply", hide_floaters=True)
     assert count == int((~floats).sum()) < scene.export(tmp_path / "all.ply")
+
+
+@pytest.mark.slow
+def test_a_misspelled_word_is_offered_where_the_answer_is_not_sure(browser, file):  # noqa: F811
+    with live(file) as server:
+        page = opened(browser, address_of(server), DESK)
+        page.evaluate("lang3dxl.ask('windwos')")
+        assert "Did you mean windows?" in page.locator("#near").inner_text()
+        page.locator("#near").get_by_role("button", name="windows", exact=True).click()
+        page.locator("#prompts strong", has_text="windows").wait_for()
+        assert page.locator("#prompts strong").all_inner_texts() == ["windows"]
+        assert page.locator("#near").inner_text() == "" and page.complaints == []
+        page.close()

@@ -17,6 +17,7 @@ import torch.nn.functional as F
 from painted_scene import (
     encode_texts,
     painted_codes,
+    painted_file,
     painted_looks,
     painted_scene,
     painted_splats,
@@ -33,7 +34,7 @@ from lang3dxl_ns.query.question import QueryConfig
 from lang3dxl_ns.query.scene import NO_SEMANTICS
 from lang3dxl_ns.query.vocabulary import common_words, shipped_vocabulary, whole_words
 from lang3dxl_ns.web.write_page import Page, write_page
-from lang3dxl_ns.words.taught_words import TaughtWord
+from lang3dxl_ns.words.taught_words import Example, TaughtWord
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 SWITCHES = [
@@ -431,6 +432,50 @@ def test_a_named_word_is_kept_offered_and_forgotten(page, scene, browser, addres
 
 
 @pytest.mark.slow
+def test_cameras_are_drawn_and_doubtful_ones_apart_with_their_reason(browser, tmp_path):
+    file = painted_file()
+    photos = [
+        replace(photo, doubtful="it looks away" if k == 1 else None) for k, photo in enumerate(file.photos)
+    ]
+    write_page(Page(painted_scene(file=replace(file, photos=photos))), tmp_path)
+    with served(tmp_path) as address:
+        page = opened(browser, address, DESK)
+        page.evaluate("lang3dxl.view.mover.free = true")
+        for _ in range(12):
+            page.locator("#frame").press("s")  # until the cameras stand before the eye
+        page.get_by_role("button", name="Cameras").click()
+        drawn = (
+            "(kind) => document.querySelector(`#pyramids .${kind}`).getAttribute('d').split('M').length - 1"
+        )
+        rest(page)
+        assert [page.evaluate(drawn, kind) for kind in ("sure", "doubtful")] == [8, 4]  # edges
+        page.get_by_role("button", name="Next view").click()
+        page.get_by_role("button", name="Next view").click()
+        assert "doubtful: it looks away" in page.locator("#status").inner_text()
+        page.close()
+
+
+@pytest.mark.slow
+def test_a_scene_suggests_its_own_words_and_taught_ones_first_and_splits_none_of_them(browser, tmp_path):
+    scene = painted_scene().teach("Lords and ladies", Example("all/0003.jpg", points=((69, 69),)))
+    write_page(Page(scene), tmp_path)
+    with served(tmp_path) as address:
+        page = opened(browser, address, DESK)
+        offered = page.locator("#try button")
+        offered.first.wait_for()
+        words = offered.all_inner_texts()
+        assert words[0] == "Lords and ladies" and "windows" in words and "minarets" not in words
+        page.get_by_role("combobox", name="Look for").focus()
+        page.locator("#offered option").first.wait_for(state="attached")
+        listed = page.evaluate("[...document.querySelectorAll('#offered option')].map(({ value }) => value)")
+        assert listed[: len(words)] == words
+        page.evaluate("lang3dxl.ask('windows and lords and ladies')")
+        assert [text.lower() for text in prompts_of(page)] == ["windows", "lords and ladies"]
+        assert page.complaints == []
+        page.close()
+
+
+@pytest.mark.slow
 def test_a_slow_machine_draws_drafts_until_nothing_changes(page):
     picture(page)
     width = page.evaluate("document.querySelector('#frame canvas').width")
@@ -457,6 +502,15 @@ def test_ask_answers_and_hostile_texts_stay_texts(page):
     page.evaluate("location.hash = 'view=nan,1,2&ask=%22%3Cimg%20src=x%3E&like=~x~-1.9e9~&not=%00'")
     page.wait_for_timeout(500)
     assert page.locator("img:not(#photo)").count() == 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("text", ["window%3B", "ask=window&ask=", "a" + "%20" * 32_000 + "b", "%22a", "not+"])
+def test_a_link_of_any_length_opens_at_once_with_at_most_twenty_prompts(page, text):
+    page.evaluate(f"location.hash = 'ask=' + {text!r}.repeat({text!r}.length > 99 ? 1 : 10000)")
+    page.wait_for_function("document.querySelectorAll('#prompts > *').length < 21", timeout=5_000)
+    assert page.evaluate("lang3dxl.ask('dome')")["known"]  # the page answers again
+    assert len(prompts_of(page)) <= 21
 
 
 @pytest.mark.slow
@@ -852,9 +906,17 @@ def test_from_a_folder_it_says_what_it_needs(browser, scene, tmp_path):
 
 def test_a_page_is_complete_and_small(scene):
     files = Page(scene, ["dome; window"]).files()
-    own = {name for name in files if name.endswith((".html", ".css", ".js", ".txt"))}
-    assert {"index.html", "page.css", "page.js", "worker.js", "splats.js", "LICENSES.txt"} <= own
-    assert sum(len(files[name]) for name in own) < 4e6
+    own = {name for name in files if name.endswith((".html", ".css", ".js", ".txt", "spark.bin"))}
+    assert {
+        "index.html",
+        "page.css",
+        "page.js",
+        "worker.js",
+        "library.js",
+        "spark.bin",
+        "LICENSES.txt",
+    } <= own
+    assert sum(len(files[name]) for name in own) < 1.4e6
     licenses = files["LICENSES.txt"].decode()
     assert all(name in licenses for name in ("three 0", "spark 2", "fflate 0", "MIT License"))
     assert json.loads(files["scene.json"])["prompts"] == [["dome"], ["window"]]

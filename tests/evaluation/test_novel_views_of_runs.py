@@ -6,15 +6,16 @@ import shutil
 import numpy as np
 import pytest
 import torch
-from conftest import make_trainer
+from conftest import fitted
 from label_sets import write_plain
 from PIL import Image
 
 from lab.landmark.demo_scene import FOLDER
 from lab.landmark.novel_views import read_novel_views
-from lab.landmark.novel_views_of_runs import evaluate_novel_views, novel_dataset
+from lab.landmark.novel_views_of_runs import evaluate_novel_views, novel_data
 from lab.landmark.scene_writer import write_novel_cameras
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.evaluation.score_run import Evaluation, EvaluationSettings
 from lang3dxl_ns.scene.colmap import read_reconstruction
 
 HELD_OUT = ("photo_000.jpg", "photo_008.jpg")
@@ -39,22 +40,20 @@ def data(scene, tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def pipeline(data, tiny_clip, tiny_dense, tmp_path_factory):
-    """Of a finished run of two steps, to evaluate."""
-    trainer = make_trainer(data, tiny_clip, tiny_dense, tmp_path_factory.mktemp("run"), iterations=2)
-    trainer.setup()
-    trainer.train()
-    return trainer.pipeline
+def run(data, tiny_clip, tiny_dense, tmp_path_factory):
+    """A finished run of two steps, to evaluate."""
+    return fitted(data, tiny_clip, tiny_dense, tmp_path_factory.mktemp("run"))
 
 
-def test_a_photo_as_a_test_view_is_placed_and_scored_as_the_photo(pipeline, data):
-    manager = pipeline.datamanager
-    views = novel_dataset(manager, read_novel_views(data))
-    for name in ("camera_to_worlds", "fx", "fy", "cx", "cy", "width", "height"):
-        own, photo = (getattr(d.cameras, name) for d in (views, manager.eval_dataset))
-        torch.testing.assert_close(own, photo, atol=1e-4, rtol=1e-5)
-    results = pipeline.get_average_eval_image_metrics(get_std=True)
-    beside = {view.name: view.metrics for view in evaluate_novel_views(pipeline)}
+def test_a_photo_as_a_test_view_is_placed_and_scored_as_the_photo(run, data):
+    views = novel_data(run.data, read_novel_views(data)).views
+    for name in HELD_OUT:
+        own, photo = views[f"{FOLDER}/{name}"], run.data.views[name]
+        torch.testing.assert_close(own.pose, photo.pose, atol=1e-4, rtol=1e-5)
+        torch.testing.assert_close(own.intrinsics, photo.intrinsics, atol=1e-4, rtol=1e-5)
+        assert (own.width, own.height) == (photo.width, photo.height)
+    results = Evaluation(run.state, run.data, EvaluationSettings()).scored(get_std=True)
+    beside = {view.name: view.metrics for view in evaluate_novel_views(run.state, run.data)}
     assert set(beside) == {f"{FOLDER}/{name}" for name in HELD_OUT}
     for name, photo in results["photos"].items():
         view = beside[f"{FOLDER}/{name}"]
@@ -67,18 +66,21 @@ def test_a_photo_as_a_test_view_is_placed_and_scored_as_the_photo(pipeline, data
     assert results["limit_map"] > results["chance_map"] == pytest.approx(0.5, abs=0.02)
 
 
-def test_in_another_light_colors_are_compared_once_matched(pipeline, data):
+def test_in_another_light_colors_are_compared_once_matched(run, data):
     path = data / FOLDER / "cameras.json"
     content = path.read_text()
     path.write_text(json.dumps(json.loads(content) | {"same_light": False}))
     try:
-        metrics = next(iter(evaluate_novel_views(pipeline))).metrics
+        metrics = next(iter(evaluate_novel_views(run.state, run.data))).metrics
     finally:
         path.write_text(content)
     assert "cc_psnr" in metrics and not {"psnr", "ssim"} & set(metrics)
 
 
-def test_a_scene_without_test_views_says_so(train, scene):
-    pipeline = train(scene, iterations=2, semantics=False).pipeline
-    with pytest.raises(UserError, match=r"has no test views: `lang3dxl demo-scene` makes"):
-        list(evaluate_novel_views(pipeline))
+def test_a_scene_without_test_views_says_so(run, data):
+    (data / FOLDER).rename(data / "away")
+    try:
+        with pytest.raises(UserError, match=r"has no test views: `lang3dxl demo-scene` makes"):
+            list(evaluate_novel_views(run.state, run.data))
+    finally:
+        (data / "away").rename(data / FOLDER)

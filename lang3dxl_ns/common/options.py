@@ -1,0 +1,25 @@
+"""How messages spell the options of the command that runs."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+_DATA, _MODEL = "--pipeline.datamanager.", "--pipeline.model."
+
+
+def data_option(name: str) -> str:
+    """Spell an option of photos and their targets, such as `clip`: nerfstudio's commands have it at the
+    setting's place in their configuration, our own by its name."""
+    return f"{_DATA if _in_nerfstudio() else '--'}{name}"
+
+
+def model_option(name: str) -> str:
+    """Spell an option of the model, such as `max-gaussians` (see `data_option`)."""
+    return f"{_MODEL if _in_nerfstudio() else '--'}{name}"
+
+
+def _in_nerfstudio() -> bool:
+    """Return whether one of nerfstudio's commands runs, by its name or as `python -m nerfstudio.…`."""
+    command = Path(sys.argv[0] if sys.argv else "")
+    return command.name.startswith("ns-") or "nerfstudio" in command.parts

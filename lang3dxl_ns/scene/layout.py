@@ -1,0 +1,92 @@
+"""Where programs leave the parts of a scene: its COLMAP model, its photos, and cameras of other kinds."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+from lang3dxl_ns.common.console import say
+from lang3dxl_ns.scene.colmap import photos_in_model
+from lang3dxl_ns.scene.photo_folder import find_photos, photos_below
+
+MODEL_FOLDERS = (
+    *(Path("sparse/0"), Path("sparse"), Path("colmap/sparse/0"), Path("colmap/sparse"), Path("dense/sparse")),
+    *(Path("colmap"), Path(".")),
+)
+"""Usual places of a model, the first of which counts. Elsewhere, the model with the most photos does."""
+_SMALLER = tuple(Path(f"images_{factor}") for factor in (2, 4, 8))
+"""Copies of the photos at lower resolutions, which are used if there are no others."""
+_DEPTH = 3
+"""Levels of folders below a scene's that are searched for a model."""
+_RESULTS = ("lang3dxl_cache", "outputs", "nerfstudio_models")
+_OTHER_CAMERAS = {
+    **{"cameras.xml": "Metashape", "*.xmp": "RealityScan", "*.nvm": "VisualSFM", "*.sfm": "Meshroom"},
+    **{"bundle*.out": "Bundler", "sfm_data.json": "OpenMVG", "reconstruction.json": "OpenSfM"},
+    **{"poses_bounds.npy": "LLFF", "opensfm/reconstruction.json": "OpenDroneMap"},
+    **{"keyframes/corrected_cameras": "Polycam", "metadata.json": "Record3D"},
+}
+"""Files and folders with cameras that can't be read here, and the programs that write them."""
+
+
+def has_model(folder: Path) -> bool:
+    """Return whether a folder has a file of photos of a COLMAP model."""
+    return any((folder / f"images{ending}").is_file() for ending in (".bin", ".txt"))
+
+
+def whole_scene(folder: Path) -> Path:
+    """Return the scene's folder where `folder` is just its COLMAP model or its photos, else `folder`."""
+    if has_model(folder) and not any(photos_below(folder)):
+        above = (parent for parent in folder.parents[:_DEPTH] if any(photos_below(parent / "images")))
+        return next(above, folder)
+    usual = {
+        path: any(has_model(path / place) for place in MODEL_FOLDERS) for path in (folder, folder.parent)
+    }
+    photos_alone = folder.name == "images" and not usual[folder]
+    return folder.parent if photos_alone and usual[folder.parent] else folder
+
+
+def find_model(folder: Path) -> Path | None:
+    """Find the COLMAP model of a scene's folder: in the usual places, else the largest one below it, which is
+    said with the others; None without one."""
+    for place in MODEL_FOLDERS:
+        if has_model(folder / place):
+            return folder / place
+    found = {model: photos_in_model(model) for model in _models_below(folder)}
+    if not found:
+        return None
+    best = max(found, key=lambda model: (found[model], -len(model.parts)))
+    told = ", ".join(f"{os.path.relpath(model, folder)} with {count}" for model, count in found.items())
+    say(f"{folder} has a COLMAP model in {os.path.relpath(best, folder)}, which is used (photos: {told})")
+    return best
+
+
+def _models_below(folder: Path) -> Iterator[Path]:
+    for parent, folders, _ in os.walk(folder):
+        here = Path(parent)
+        deep = len(here.relative_to(folder).parts) >= _DEPTH
+        folders[:] = [] if deep else sorted(f for f in folders if f not in _RESULTS and f[0] not in "._")
+        if has_model(here) and any((here / f"cameras{ending}").is_file() for ending in (".bin", ".txt")):
+            yield here
+
+
+def images_folder(data: Path, model: Path, named: Path = Path("images")) -> Path:
+    """Return the folder of a model's photos: `named` in the scene's if it has photos, else images/ nearest
+    above the model, else wherever there are photos."""
+    above = [parent / "images" for parent in model.parents if parent.is_relative_to(data)]
+    for folder in (data / named, *above):
+        if any(photos_below(folder)):
+            return folder
+    if (found := find_photos(data)).names:
+        return found.folder
+    return next((data / path for path in _SMALLER if any(photos_below(data / path))), data / named)
+
+
+def mention_other_cameras(folder: Path) -> None:
+    """Say which cameras of other programs lie beside photos that are reconstructed anew."""
+    for pattern, program in _OTHER_CAMERAS.items():
+        if (found := next(folder.glob(pattern), None)) is not None:
+            say(
+                f"{found} holds cameras of {program}, which can't be read here: the photos are reconstructed "
+                "anew. To use them, export a COLMAP model or a transforms.json (ns-process-data) beside it"
+            )

@@ -1,0 +1,111 @@
+"""Symmetry: pairs of photos that match although they show different sides of a building, which look alike.
+
+A single pair doesn't tell: two towers match as two views of one tower do. But its rotation contradicts those
+of other pairs, around the building and through photos that see both sides. The photos are joined into groups,
+along the best supported rotations first; a pair that contradicts its group is left out of the mapping.
+"""
+
+from __future__ import annotations
+
+import sqlite3
+from collections import defaultdict
+from collections.abc import Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray as Array
+from scipy.spatial.transform import Rotation
+
+from lang3dxl_ns.scene.colmap import load_pycolmap
+from lang3dxl_ns.scene.placements import MatchedPair, matched_pairs
+
+APART = 40.0
+"""Degrees between a pair's rotation and its group's from which the pair contradicts the group. Focal lengths
+are guesses before mapping, which turns rotations by up to about half of this."""
+_VOTES = 30
+"""Strongest pairs between two groups that vote on the rotation between them."""
+_VOICES = 3
+"""Strongest agreeing votes that decide which groups are joined first: many weak pairs between like sides must
+not outweigh few strong ones around a corner."""
+
+
+@dataclass
+class _Groups:
+    """Photos in groups; a photo's rotation is that of its group's frame → camera."""
+
+    group: dict[int, int]
+    rotation: dict[int, Float[Array, "3 3"]]
+
+    def turn(self, pair: MatchedPair) -> Float[Array, "3 3"]:
+        """Return the rotation from the second photo's group to the first's that a pair measures."""
+        return self.rotation[pair.first].T @ pair.turn.T @ self.rotation[pair.second]
+
+    def join(self, kept: int, joined: int, turn: Float[Array, "3 3"]) -> None:
+        """Join a group to another, by the rotation from its frame to the other's."""
+        for photo in [photo for photo, group in self.group.items() if group == joined]:
+            self.group[photo] = kept
+            self.rotation[photo] = self.rotation[photo] @ turn.T
+
+
+def without_contradictions(database: Path, copy: Path) -> int:
+    """Copy COLMAP's database without the pairs whose rotations contradict others, and return their number."""
+    with closing(sqlite3.connect(database)) as source, closing(sqlite3.connect(copy)) as target:
+        source.backup(target)
+    with load_pycolmap().Database.open(copy) as db:
+        cameras = {image.image_id: db.read_camera(image.camera_id) for image in db.read_all_images()}
+        contradicting = contradicting_pairs(matched_pairs(db, cameras))
+        for first, second in contradicting:
+            db.delete_two_view_geometry(first, second)
+    return len(contradicting)
+
+
+def contradicting_pairs(pairs: Sequence[MatchedPair]) -> set[tuple[int, int]]:
+    """Find the pairs, by their photos' numbers, whose rotations contradict those of stronger ones."""
+    photos = {photo for pair in pairs for photo in (pair.first, pair.second)}
+    groups = _Groups({photo: photo for photo in photos}, {photo: np.eye(3) for photo in photos})
+    between: dict[tuple[int, int], list[MatchedPair]] = defaultdict(list)
+    for pair in pairs:
+        between[_key(pair.first, pair.second)].append(pair)
+    votes = {key: _vote(groups, key, found) for key, found in between.items()}
+    while votes:
+        (kept, joined), (turn, _) = max(votes.items(), key=lambda vote: vote[1][1])
+        groups.join(kept, joined, turn)
+        moved: dict[tuple[int, int], list[MatchedPair]] = defaultdict(list)
+        for key in [key for key in between if kept in key or joined in key]:
+            del votes[key]
+            first, second = (kept if end == joined else end for end in key)
+            found = between.pop(key)
+            if first != second:
+                moved[_key(first, second)] += found
+        votes |= {key: _vote(groups, key, found) for key, found in moved.items()}
+        between |= moved
+    apart = [_degrees(groups.turn(pair)[None], np.eye(3))[0] > APART for pair in pairs]
+    return {(pair.first, pair.second) for pair, far in zip(pairs, apart, strict=True) if far}
+
+
+def _key(one: int, other: int) -> tuple[int, int]:
+    return min(one, other), max(one, other)
+
+
+def _vote(
+    groups: _Groups, key: tuple[int, int], pairs: list[MatchedPair]
+) -> tuple[Float[Array, "3 3"], float]:
+    """Return the rotation from the second group to the first that the pairs between them agree on, and the
+    weight of the agreement."""
+    voting = sorted(pairs, key=lambda pair: -pair.matches)[:_VOTES]
+    turns = np.stack(
+        [groups.turn(p) if groups.group[p.first] == key[0] else groups.turn(p).T for p in voting]
+    )
+    weights = np.array([pair.matches for pair in voting], float)
+    agreeing = [_degrees(turns, turn) < APART / 2 for turn in turns]
+    weight = [weights[near][:_VOICES].sum() for near in agreeing]
+    near = agreeing[int(np.argmax(weight))]
+    return Rotation.from_matrix(turns[near]).mean(weights[near]).as_matrix(), float(max(weight))
+
+
+def _degrees(turns: Float[Array, "n 3 3"], other: Float[Array, "3 3"]) -> Float[Array, " n"]:
+    cosines = (np.einsum("nij,ij->n", turns, other) - 1) / 2
+    return np.degrees(np.arccos(np.clip(cosines, -1, 1)))

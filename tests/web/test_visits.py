@@ -1,0 +1,194 @@
+"""Visits in Chromium at two sizes: by keyboard alone, by touch alone, in forced colors, under axe."""
+
+import shutil
+import subprocess
+import tarfile
+from contextlib import contextmanager
+
+import pytest
+from painted_scene import painted_scene
+from PIL import Image
+from test_web_page import PHONE, browser, prompts_of, served  # noqa: F401
+
+from lang3dxl_ns.web.write_page import Page, write_page
+
+AXE = "axe-core@4.10.3"
+SIZES = pytest.mark.parametrize("size", [PHONE, {"width": 1440, "height": 900}], ids=["phone", "desk"])
+FOCUSED = """() => {
+  const at = document.activeElement, box = at.getBoundingClientRect(), style = getComputedStyle(at);
+  const label = at.labels?.[0]?.textContent.trim();
+  return { id: at.id, name: at.ariaLabel || at.textContent.trim() || label || at.placeholder,
+    seen: box.width > 0 && box.right > 0 && box.bottom > 0 && box.left < innerWidth && box.top < innerHeight,
+    outlined: style.outlineStyle !== "none" && parseFloat(style.outlineWidth) > 0,
+    body: at === document.body };
+}"""
+
+
+@pytest.fixture(scope="module")
+def address(tmp_path_factory):
+    """The page of the painted wall, with its photos."""
+    folder, scene = tmp_path_factory.mktemp("visits"), painted_scene()
+    for photo in scene.photos:
+        (folder / "photos" / photo.name).parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(scene.render(photo.full_camera).pixels).save(folder / "photos" / photo.name)
+    write_page(Page(scene, photos=folder / "photos"), folder / "page")
+    with served(folder / "page") as found:
+        yield found
+
+
+@pytest.fixture(scope="module")
+def axe(tmp_path_factory):
+    """The script of axe, from npm."""
+    folder = tmp_path_factory.mktemp("axe")
+    if shutil.which("npm") is None:
+        pytest.skip("needs npm, for axe-core")
+    done = subprocess.run(["npm", "pack", AXE], cwd=folder, capture_output=True, text=True, timeout=120)
+    if done.returncode:
+        pytest.skip(f"npm gives no {AXE}: {done.stderr.strip()[-200:]}")
+    with tarfile.open(next(folder.glob("*.tgz"))) as packed:
+        content = packed.extractfile("package/axe.min.js")
+        (folder / "axe.js").write_bytes(content.read())
+    return folder / "axe.js"
+
+
+@contextmanager
+def visit(browser, address, size, script=None, **media):  # noqa: F811
+    """A page that is ready, with what it complained about."""
+    context = browser.new_context(viewport=size, has_touch=size is PHONE, is_mobile=size is PHONE)
+    page = context.new_page()
+    page.set_default_timeout(120_000)
+    page.emulate_media(reduced_motion="reduce", **media)
+    if script is not None:
+        page.add_init_script(path=script)
+    complaints = []
+    page.on("pageerror", lambda error: complaints.append(str(error)))
+    page.goto(address)
+    page.evaluate("lang3dxl.ready.then(() => true)")
+    yield page
+    context.close()
+    assert complaints == []
+
+
+def until(page, question, answer=True):
+    for _ in range(100):
+        if (found := page.evaluate(question)) == answer:
+            return
+        page.wait_for_timeout(100)
+    raise AssertionError(f"{question} is {found!r}")
+
+
+def tab_to(page, name: str) -> None:
+    for _ in range(60):
+        page.keyboard.press("Tab")
+        if page.evaluate(FOCUSED)["name"] == name:
+            return
+    raise AssertionError(f"the tabulator never reaches {name!r}")
+
+
+@pytest.mark.slow
+@SIZES
+def test_every_stop_of_the_tabulator_is_seen_named_and_outlined(browser, address, size):  # noqa: F811
+    with visit(browser, address, size) as page:
+        page.evaluate("lang3dxl.ask('dome; windows')")
+        page.evaluate("document.getElementById('more').open = true")
+        stops = []
+        while not stops or (len(stops) < 80 and not page.evaluate(FOCUSED)["body"]):
+            page.keyboard.press("Tab")
+            stops.append(page.evaluate(FOCUSED))
+        stops.pop()
+        assert len(stops) > 20 and {"frame", "word", "overview"} <= {stop["id"] for stop in stops}
+        assert [stop for stop in stops if not (stop["name"] and stop["seen"] and stop["outlined"])] == []
+
+
+@pytest.mark.slow
+@SIZES
+def test_a_visit_by_keyboard_alone(browser, address, size):  # noqa: F811
+    with visit(browser, address, size) as page:
+        page.keyboard.press("/")
+        page.keyboard.type("dome; windows")
+        page.keyboard.press("Enter")
+        until(page, "lang3dxl.prompts.length", 2)
+        page.keyboard.press("Escape")  # out of the search box
+        level = page.evaluate("lang3dxl.prompts[0].threshold")
+        tab_to(page, "Threshold of dome")
+        page.keyboard.press("ArrowRight")
+        until(page, f"lang3dxl.prompts[0].threshold > {level}")
+        page.keyboard.press("Control+z")
+        until(page, f"Math.abs(lang3dxl.prompts[0].threshold - {level}) < 1e-6")
+        tab_to(page, "Remove windows")
+        page.keyboard.press("Enter")
+        until(page, "lang3dxl.prompts.length", 1)
+        page.keyboard.press(".")
+        until(page, "document.getElementById('over').hidden", False)
+        page.keyboard.press("Escape")
+        until(page, "document.getElementById('over').hidden")
+        tab_to(page, "The scene")
+        stand = page.evaluate("lang3dxl.view.mover.address")
+        page.keyboard.press("s")
+        until(page, f"lang3dxl.view.mover.address !== '{stand}'")
+        page.keyboard.press("Home")
+        page.keyboard.press("Enter")  # what is in the middle
+        until(page, "document.getElementById('here').hidden", False)
+        page.keyboard.press("Escape")
+        until(page, "document.getElementById('here').hidden")
+        assert prompts_of(page) == ["dome"]
+
+
+@pytest.mark.slow
+def test_a_visit_by_touch_alone(browser, address):  # noqa: F811
+    with visit(browser, address, PHONE) as page:
+        tap = lambda name, **how: page.get_by_role("button", name=name, exact=True, **how).first.tap()  # noqa: E731
+        tap("windows")  # a suggestion
+        until(page, "lang3dxl.prompts.length", 1)
+        page.get_by_role("combobox", name="Look for").tap()
+        page.keyboard.insert_text("dome")
+        tap("Ask")
+        until(page, "lang3dxl.prompts.length", 2)
+        for name in ("Overview", "Copy link"):  # not below the fold
+            box = page.get_by_role("button", name=name).bounding_box()
+            assert box["y"] >= 0 and box["y"] + box["height"] <= PHONE["height"]
+        tap("Fly to")
+        until(page, "lang3dxl.view.mover.flight === null || !lang3dxl.view.mover.flight")
+        tap("Overview")
+        point = page.evaluate("lang3dxl.view.pixel([-0.8, -0.8, 0])")  # a window
+        corner = page.locator("#frame canvas").bounding_box()
+        page.touchscreen.tap(corner["x"] + point[0], corner["y"] + point[1])
+        tap("Like this")
+        until(page, "lang3dxl.prompts.length", 3)
+        tap("Done")
+        tap("Undo")
+        until(page, "lang3dxl.prompts.length", 2)
+        page.locator("#strip button").first.tap()
+        until(page, "document.getElementById('over').hidden", False)
+        tap("Hide photo")
+        until(page, "document.getElementById('over').hidden")
+        assert page.evaluate("document.documentElement.scrollWidth") <= PHONE["width"]
+
+
+@pytest.mark.slow
+@SIZES
+def test_forced_colors_keep_the_colors_that_tell_prompts_apart(browser, address, size):  # noqa: F811
+    with visit(browser, address, size, forced_colors="active") as page:
+        page.evaluate("lang3dxl.ask('dome; windows')")
+        cards = page.evaluate("""[...document.querySelectorAll("#prompts li")].map((card) => [
+          getComputedStyle(card).borderLeftColor,
+          getComputedStyle(card.querySelector(".heat")).backgroundImage])""")
+        wanted = page.evaluate("lang3dxl.prompts.map(({ color }) => `rgb(${color.join(', ')})`)")
+        assert [border for border, _ in cards] == wanted and len(set(wanted)) == 2
+        assert all(rgb in heat for rgb, heat in cards)
+
+
+@pytest.mark.slow
+@SIZES
+def test_axe_finds_nothing(browser, address, axe, size):  # noqa: F811
+    run = """axe.run().then(({ violations }) =>
+      violations.map(({ id, nodes }) => [id, nodes.map(({ html }) => html)]))"""
+    with visit(browser, address, size, axe) as page:
+        assert page.evaluate(run) == []
+        page.evaluate("lang3dxl.ask('dome; windows; zzz')")
+        page.evaluate("document.getElementById('more').open = true")
+        assert page.evaluate(run) == []
+        page.get_by_role("button", name="Teach a word").click()
+        page.locator("#strip button").first.click()
+        until(page, "document.getElementById('over').hidden", False)
+        assert page.evaluate(run) == []
