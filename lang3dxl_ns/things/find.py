@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch
@@ -20,6 +21,8 @@ from lang3dxl_ns.things.thing import Sighting, Thing, upright_box
 
 COLORED = 20
 """Number of Gaussians within and around the matches below which colors tell nothing."""
+_KNOWN: WeakKeyDictionary[Scene, list[Thing]] = WeakKeyDictionary()
+"""Things that were found in each scene so far: they keep their ids."""
 SAME = 0.5
 """Overlap (intersection over union of weights) from which two words' things are one."""
 
@@ -49,7 +52,8 @@ def things_of(scene: Scene, texts: str | Sequence[str]) -> list[Things]:
 
     Every training view's heat map falls into pieces (`pieces_of`), and pieces of several views are one thing
     where they share Gaussians (`join`). Where a prompt's colors differ from those around it, colors separate
-    neighbors: the wall between two windows that CLIP sees as one.
+    neighbors: the wall between two windows that CLIP sees as one. A thing that an earlier question to this
+    scene found keeps its id.
 
     Raises UserError as `Scene.ask` does.
     """
@@ -63,7 +67,7 @@ def things_of(scene: Scene, texts: str | Sequence[str]) -> list[Things]:
     for views in _views(scene, torch.stack(sharp, 1)):
         for found, shown, there in zip(pieces, views, present, strict=True):
             found += pieces_of(shown) if there else []
-    answers, known = list[Things](), list[Thing]()
+    answers, known = list[Things](), _KNOWN.setdefault(scene, [])
     for i, prompt in enumerate(question.prompts):
         weight = np.sqrt(mass) * question.relevancy[i].double().cpu().numpy()
         candidates = join(pieces[i], weight)
@@ -71,7 +75,7 @@ def things_of(scene: Scene, texts: str | Sequence[str]) -> list[Things]:
         sure = [one for one in joined if one.views >= VIEWS]
         things = [_thing(scene, prompt.text, one, mass, question.relevancy[i], up) for one in sure]
         things = [_known(thing, known, mass) for thing in things]
-        known += things
+        known += [thing for thing in things if all(thing.id != other.id for other in known)]
         least = sum(one.views > VIEWS for one in joined)
         caution = doubtful(prompt.text, question.doubts[i], prompt.taught is not None)
         answers.append(Things(prompt.text, things, least, len(candidates), caution))
