@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch
@@ -18,9 +19,11 @@ from lang3dxl_ns.things.join import VIEWS, Joined, join, without_crumbs
 from lang3dxl_ns.things.pieces import LEVELS, Piece, Shown, pieces_of
 from lang3dxl_ns.things.thing import Sighting, Thing, upright_box
 
-_COLORED = 20
+COLORED = 20
 """Number of Gaussians within and around the matches below which colors tell nothing."""
-_SAME = 0.5
+_KNOWN: WeakKeyDictionary[Scene, list[Thing]] = WeakKeyDictionary()
+"""Things that were found in each scene so far: they keep their ids."""
+SAME = 0.5
 """Overlap (intersection over union of weights) from which two words' things are one."""
 
 
@@ -49,7 +52,8 @@ def things_of(scene: Scene, texts: str | Sequence[str]) -> list[Things]:
 
     Every training view's heat map falls into pieces (`pieces_of`), and pieces of several views are one thing
     where they share Gaussians (`join`). Where a prompt's colors differ from those around it, colors separate
-    neighbors: the wall between two windows that CLIP sees as one.
+    neighbors: the wall between two windows that CLIP sees as one. A thing that an earlier question to this
+    scene found keeps its id.
 
     Raises UserError as `Scene.ask` does.
     """
@@ -63,7 +67,7 @@ def things_of(scene: Scene, texts: str | Sequence[str]) -> list[Things]:
     for views in _views(scene, torch.stack(sharp, 1)):
         for found, shown, there in zip(pieces, views, present, strict=True):
             found += pieces_of(shown) if there else []
-    answers, known = list[Things](), list[Thing]()
+    answers, known = list[Things](), _KNOWN.setdefault(scene, [])
     for i, prompt in enumerate(question.prompts):
         weight = np.sqrt(mass) * question.relevancy[i].double().cpu().numpy()
         candidates = join(pieces[i], weight)
@@ -71,7 +75,7 @@ def things_of(scene: Scene, texts: str | Sequence[str]) -> list[Things]:
         sure = [one for one in joined if one.views >= VIEWS]
         things = [_thing(scene, prompt.text, one, mass, question.relevancy[i], up) for one in sure]
         things = [_known(thing, known, mass) for thing in things]
-        known += things
+        known += [thing for thing in things if all(thing.id != other.id for other in known)]
         least = sum(one.views > VIEWS for one in joined)
         caution = doubtful(prompt.text, question.doubts[i], prompt.taught is not None)
         answers.append(Things(prompt.text, things, least, len(candidates), caution))
@@ -95,11 +99,11 @@ def _sharpened(scene: Scene, relevancy: Float[Tensor, " n"]) -> Float[Tensor, " 
     means, colors = scene.splats.means.cpu().numpy(), scene.splats.harmonics[:, 0].cpu().numpy()
     values, mass = relevancy.cpu().numpy(), scene.mass.cpu().numpy()
     match = np.flatnonzero((values > 0.9) & (mass > 0))
-    if len(match) < _COLORED:
+    if len(match) < COLORED:
         return relevancy
     near = np.isfinite(KDTree(means[match]).query(means, distance_upper_bound=scene.gap)[0])
     around = np.flatnonzero((values < 0.5) & near & (mass > 0))
-    if len(around) < _COLORED:
+    if len(around) < COLORED:
         return relevancy
     rows = np.concatenate([match, around])
     weight = np.sqrt(mass[rows]) * len(rows) / 2
@@ -152,6 +156,6 @@ def _known(thing: Thing, known: Sequence[Thing], mass: Float[Array, " n"]) -> Th
     """Give a thing the id of one that another word found at the same place."""
     for other in known:
         shared = mass[np.intersect1d(thing.rows, other.rows)].sum()
-        if shared > _SAME * mass[np.union1d(thing.rows, other.rows)].sum():
+        if shared > SAME * mass[np.union1d(thing.rows, other.rows)].sum():
             return replace(thing, id=other.id)
     return thing

@@ -22,9 +22,9 @@ from lang3dxl_ns.common.files import read_json
 from lang3dxl_ns.things.find import Things
 from lang3dxl_ns.things.thing import Thing
 
-_BESIDE = 1.5
+BESIDE = 1.5
 """Distance, relative to the mean longest edge of two things, up to which they are next to each other."""
-_INSIDE = 0.7
+INSIDE = 0.7
 """Half-size of a box, relative to its own edges, within which a center is in or on it."""
 
 
@@ -77,14 +77,14 @@ def parse(text: str) -> Request:
     without, relation, others = None, None, tuple[str, ...]()
     if found := re.fullmatch(r"(.+?) (?:but )?not (.+)", rest):
         rest, without = found[1], _plain(found[2])
-    along, nth, superlative = None, None, None
-    if found := re.fullmatch(rf"(.+?) (?:from|on) the ({_any(words['from'])})(?: (.+))?", rest):
-        rest, along = f"{found[1]} {found[3] or ''}".strip(), found[2]
     if found := re.fullmatch(rf"(.+?) ({_any(words['relations'])}) (.+)", rest):
         rest, relation = found[1], words["relations"][found[2]]
         others = tuple(_plain(part) for part in re.split(r"\s+and\s+", found[3]))
-        if (len(others) == 2) != (relation == "between") and not (relation == "between" and len(others) == 1):
+        if len(others) > (2 if relation == "between" else 1):
             raise UserError(f"{found[2]} {found[3]}: name one thing, or two with between … and …")
+    along, nth, superlative = None, None, None
+    if found := re.fullmatch(rf"(.+?) (?:from|on) the ({_any(words['from'])})", rest):
+        rest, along = found[1], found[2]
     rest = _plain(rest)
     first, _, noun = rest.partition(" ")
     if noun and first in words["superlatives"]:
@@ -93,11 +93,27 @@ def parse(text: str) -> Request:
         nth, rest = words["ordinals"].get(first) or int(first[:-2]), noun
         if along is None or nth < 1:
             raise UserError(f"{first} {noun}: say from which side, such as the {first} {noun} from the left")
-    elif along is not None:
+    if along is not None and nth is None:
         raise UserError(f"from the {along}: say which one, such as the second {rest} from the {along}")
-    if not rest:
-        raise UserError(f"{text!r} names no thing: ask for one, such as how many windows")
+    for name in (rest, *others, *([] if without is None else [without])):
+        _check_name(name)
     return Request(rest, count, superlative, nth, along, relation, others, without)
+
+
+def _check_name(name: str) -> None:
+    """Raise UserError for an empty name, or one with words of questions that the grammar can't use."""
+    words = table()
+    if not name:
+        raise UserError("this names no thing: ask for one, such as how many windows")
+    unused = [word for word in name.split() if word in words["unknown"] or word in words["ordinals"]]
+    unused += [word for word in name.split() if word in words["superlatives"]]
+    unused += re.findall(rf"\b(?:{_any(words['relations'])})\b", name)
+    if unused:
+        told = ", ".join(dict.fromkeys(unused))
+        raise UserError(
+            f"{name}: a question can't use {told} here; ask how many windows, for the highest tower, "
+            "the third window from the left, or windows above the portal"
+        )
 
 
 def answer(request: Request, found: Iterable[Things], sight: Callable[[list[Thing]], Sight]) -> list[Thing]:
@@ -156,8 +172,8 @@ def holds(thing: Thing, relation: str, other: Thing, view: Sight) -> bool:
     if relation in ("front", "behind"):
         return bool((apart @ view.ahead) * (1 if relation == "behind" else -1) > other.size[:2].max() / 2)
     if relation == "beside":
-        return bool(np.linalg.norm(apart) < _BESIDE * (thing.size.max() + other.size.max()) / 2)
-    return bool((abs(other.axes @ apart) <= _INSIDE * np.maximum(other.size, other.size.max() / 10)).all())
+        return bool(np.linalg.norm(apart) < BESIDE * (thing.size.max() + other.size.max()) / 2)
+    return bool((abs(other.axes @ apart) <= INSIDE * np.maximum(other.size, other.size.max() / 10)).all())
 
 
 def _between(thing: Thing, a: Thing, b: Thing) -> bool:
@@ -173,7 +189,7 @@ def _taken(text: str, phrases: list[str]) -> tuple[bool, str]:
 
 
 def _plain(text: str) -> str:
-    return re.sub(rf"^(?:{_any(table()['articles'])})\s+", "", text.strip())
+    return re.sub(rf"^(?:(?:{_any(table()['articles'])})\s+)+", "", text.strip())
 
 
 def _any(phrases: Iterable[str]) -> str:

@@ -23,7 +23,7 @@ VIEWS = 2
 CRUMB = 0.03
 """Weight, relative to the typical thing's (half of all weight is in heavier ones), below which a thing is a
 crumb of another."""
-_MOST_SHARED = 0.5
+MOST_SHARED = 0.5
 """Share of a piece's weight that may belong to known things if it is to be a new one."""
 
 
@@ -67,7 +67,7 @@ def join(pieces: Sequence[Piece], weight: Float[Array, " n"]) -> list[Joined]:
         if things and (shared[best] > SHARED * total or of_things[best] > SHARED):
             if of_things[best] >= SPLINTER and not (piece.cut and of_things[best] <= SHARED):
                 things[best].votes.append(piece)
-        elif not piece.cut and shared.sum() <= _MOST_SHARED * total:
+        elif not piece.cut and shared.sum() <= MOST_SHARED * total:
             rows = piece.rows[mine < 0]
             owner[rows] = len(things)
             things.append(Joined(rows, float(weight[rows].sum()), [piece]))

@@ -16,7 +16,7 @@ LEAST = 6
 """Pixels below which a region is noise."""
 PART = 0.25
 """Share of a region that each of its parts must hold for the region to be split."""
-_DEPTH = 0.05
+DEPTH = 0.05
 """Relative distance from the visible surface within which a Gaussian belongs to a pixel."""
 
 
@@ -62,7 +62,7 @@ def pieces_of(shown: Shown) -> Iterator[Piece]:
     x, y, z = shown.points.T
     inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
     x, y, z, rows = x[inside].astype(int), y[inside].astype(int), z[inside], shown.rows[inside]
-    on = (labels[y, x] > 0) & (abs(z - shown.depth[y, x]) < _DEPTH * z)
+    on = (labels[y, x] > 0) & (abs(z - shown.depth[y, x]) < DEPTH * z)
     which, rows = labels[y, x][on], rows[on]
     order = which.argsort(kind="stable")
     ends = np.searchsorted(which[order], np.arange(1, count + 2))

@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray as Array
 
-_OUTLIERS = 0.03
+OUTLIERS = 0.03
 """Share of a thing's weight that its box leaves out at either end of each axis."""
-_TURNS = 30
+TURNS = 30
 """Number of directions that are tried for a box, over a quarter turn."""
 
 
@@ -68,7 +68,7 @@ def upright_box(
     aside /= np.linalg.norm(aside)
     ahead = np.cross(up, aside)
     boxes = []
-    for angle in np.arange(_TURNS) * (np.pi / 2 / _TURNS):
+    for angle in np.arange(TURNS) * (np.pi / 2 / TURNS):
         level = np.cos(angle) * aside + np.sin(angle) * ahead
         axes = np.stack([level, np.cross(up, level), up])
         ends = np.stack([_ends(along, weight) for along in (points @ axes.T).T])
@@ -81,4 +81,4 @@ def upright_box(
 def _ends(values: Float[Array, " m"], weight: Float[Array, " m"]) -> Float[Array, "2"]:
     order = values.argsort()
     below = (weight[order].cumsum() - weight[order] / 2) / weight.sum()
-    return np.interp((_OUTLIERS, 1 - _OUTLIERS), below, values[order])
+    return np.interp((OUTLIERS, 1 - OUTLIERS), below, values[order])

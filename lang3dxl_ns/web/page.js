@@ -1,8 +1,10 @@
 // The page: the search box and its prompts, answers to clicks, words that are taught, and the keys.
 import { element, explain, matched, percent, promptCard, say, shown } from "./cards.js";
 import { Detail } from "./detail.js";
+import { isQuestion } from "./grammar.js";
 import { Kept, readFields, Steps, written, MOST_PROMPTS } from "./history.js";
 import { unpacked } from "./library.js";
+import { List } from "./list.js";
 import { distanceAsText } from "./measure.js";
 import { Photos } from "./photos.js";
 import { areExamples, asPython, drawOutline, examplesAsText, examplesFromText, inside, rounded, UNNAMED, wordsFile } from "./teach.js";
@@ -13,7 +15,7 @@ import { View } from "./view.js";
 const TYPING = 500, MOST_TRIED = 6, TIE = 0.02; // milliseconds until negatives take effect; suggested words; relevancies that tell words apart
 const $ = (id) => document.getElementById(id);
 const prompts = [], taughtHere = new Set(); // names that were taught to the server's scene from here
-let about, view, photos, steps, kept, latest = null, settled = false, cleared = 0; // settled: the address has been read; cleared: how often all prompts were removed
+let about, view, photos, list, steps, kept, latest = null, settled = false, cleared = 0; // settled: the address has been read; cleared: how often all prompts were removed
 let ends = [], outlining = null, chosenLook = "";
 
 const think = thinker(
@@ -76,6 +78,7 @@ function clear() {
 async function ask(typed, turn = cleared) {
   await reading;
   quiet();
+  if (about.words && isQuestion(String(typed))) return answerQuestion(String(typed));
   let found = null;
   for (const { text, negatives } of about.words ? parsePrompts(String(typed), names()) : []) {
     const word = namedWord(text) ?? { text };
@@ -95,6 +98,13 @@ async function ask(typed, turn = cleared) {
   }
   const { known = false, doubtful = true, threshold = null, peak = 0, matching = 0 } = found ?? {};
   return { known, doubtful, threshold, peak, matching };
+}
+
+/** Answer a question about things, such as "how many windows" or "highest tower". */
+async function answerQuestion(typed) {
+  const told = await list.question(typed, async (word) => (await ask(`"${word}"`)).known);
+  if (told) say(told);
+  return { known: told !== null, told };
 }
 
 function add(prompt) {
@@ -143,8 +153,12 @@ async function attempt(work) {
 /** Show all prompts, and scroll to `newest`, for small panels. */
 function draw(newest = null) {
   const acts = { fly, remove, rename, dragThreshold, setThreshold, teach, outline, save, forget }, focused = document.activeElement;
+  list.tidy();
   const [from, label] = [prompts.find(({ card }) => card?.contains(focused)), focused?.ariaLabel ?? focused?.textContent];
-  for (const prompt of prompts) prompt.card = promptCard(prompt, acts);
+  for (const prompt of prompts) {
+    prompt.card = promptCard(prompt, acts);
+    prompt.card.append(list.part(prompt) ?? "");
+  }
   $("prompts").replaceChildren(...prompts.map(({ card }) => card));
   [...(from?.card.querySelectorAll("button, input") ?? [])].find((one) => (one.ariaLabel ?? one.textContent) === label)?.focus();
   $("try").hidden = prompts.length > 0;
@@ -155,8 +169,8 @@ function draw(newest = null) {
 }
 
 function drawBoxes() {
-  const boxes = $("boxed").checked ? prompts.filter((prompt) => prompt.box) : [];
-  $("boxes").replaceChildren(...boxes.flatMap(outlineBox));
+  const boxes = $("boxed").checked ? prompts.filter((prompt) => prompt.box && !prompt.listed) : [];
+  $("boxes").replaceChildren(...boxes.flatMap(outlineBox), ...list.outlines());
 }
 
 const CORNERS = [0, 1, 2, 3, 4, 5, 6, 7], NAMESPACE = "http://www.w3.org/2000/svg";
@@ -239,7 +253,9 @@ async function tell({ x, y, without }) {
   if ($("measuring").checked) return measure(x, y);
   const teaching = prompts.find((prompt) => prompt.examples && prompt.open);
   if (teaching) return addMark(teaching, [[x, y]], without || teaching.without);
-  const words = await whatIs(x, y), { rows } = latest, best = words[0]?.[1] ?? 0;
+  const words = await whatIs(x, y), { rows } = latest;
+  if (list.pick(rows)) return;
+  const best = words[0]?.[1] ?? 0;
   const tied = words.filter(([, score]) => score > best - TIE), several = tied.length > 2;
   const buttons = (several ? tied : words).map(([word, score]) => choice(several ? word : `${word} ${percent(score)}`, () => ask(word)));
   quiet();
@@ -368,7 +384,7 @@ function asField(prompt) {
 const shownNow = () =>
   written({
     view: view.mover.address, walk: view.mover.walking ? 1 : "", not: $("not").value, hide: Number($("hide").value) || "", look: chosenLook,
-    boxes: $("boxed").checked ? 1 : "", cameras: $("cameras").ariaPressed === "true" ? 1 : "", photo: photos.shown?.name,
+    boxes: $("boxed").checked ? 1 : "", cameras: $("cameras").ariaPressed === "true" ? 1 : "", photo: photos.shown?.name, ...list.fields,
     prompts: prompts.filter(({ examples }) => !examples || examples.length).map(asField),
   }); // prettier-ignore
 
@@ -402,6 +418,7 @@ async function apply(hash, turn = drop()) {
       else if (!found.includes(prompt)) found.push(Object.assign(prompt, { color: about.colors[one.hue % about.colors.length], open: prompt.text === open }));
     }
     prompts.splice(0, prompts.length, ...found);
+    list.fields = wanted;
     for (const prompt of found) if (prompt.named) keepWord(prompt);
     for (const prompt of found) if (taughtHere.has(prompt.text) && !prompt.inScene) attempt(() => teachScene(prompt));
     if (wanted.photo && photos.named(wanted.photo)?.photo) photos.show(photos.named(wanted.photo));
@@ -484,6 +501,8 @@ function listen() {
   view.addEventListener("click", ({ detail }) => attempt(() => tell(detail)));
   view.addEventListener("double", ({ detail }) => attempt(() => focusOn(detail)));
   view.addEventListener("drawn", findPlaces);
+  view.addEventListener("drawn", () => list.findAll());
+  list.addEventListener("change", () => draw());
   view.addEventListener("moved", () => {
     drawBoxes();
     clearTimeout(moving);
@@ -506,7 +525,7 @@ function press(event) {
   const again = key.toLowerCase() === "y" || event.shiftKey, onPicture = event.target === $("frame") || event.target === document.body;
   const act = command
     ? { z: () => (again ? steps.redo() : steps.undo()), y: () => steps.redo() }[key.toLowerCase()]
-    : { "/": () => $("word").focus(), ",": () => photos.step(-1), ".": () => photos.step(1), ...(onPicture && { Enter: () => tell(middle()), f: () => focusOn(middle()) }) }[key];
+    : { "/": () => $("word").focus(), ",": () => photos.step(-1), ".": () => photos.step(1), "[": () => list.step(-1), "]": () => list.step(1), ...(onPicture && { Enter: () => tell(middle()), f: () => focusOn(middle()) }) }[key];
   if (!act) return;
   event.preventDefault();
   attempt(async () => act());
@@ -519,6 +538,7 @@ function close() {
   else if (photos.shown || photos.coming) photos.hide();
   else if (!$("here").hidden) $("here").hidden = true;
   else if (open) teach(open, false);
+  else if (list.leave()) return;
   else quiet();
 }
 
@@ -579,6 +599,7 @@ async function open() {
   const splats = await (await fetched("splats.bin")).arrayBuffer();
   await unpacked;
   view = new View(about, $("frame"));
+  list = new List(about, think, view, prompts);
   photos = new Photos(about, view, (name) => attempt(() => light(name === null ? chosenLook : name in about.looks ? name : chosenLook)));
   photos.changed = () => keepAddress();
   steps = new Steps((hash) => attempt(() => apply(hash)), () => {

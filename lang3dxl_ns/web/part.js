@@ -34,8 +34,8 @@ export class Part {
   }
 
   /** Show heat: layers of { relevancy, threshold, peak, color }, the strongest where several match. heat: returns the
-   * relevancy of this part's Gaussians where it is known; the others have that of chunk 0. limit: hides what floats more. */
-  paint(layers, heat, limit) {
+   * relevancy of this part's Gaussians where it is known; the others have that of chunk 0. limit: hides what floats more; only: rows of chunk 0 that are shown, or null. */
+  paint(layers, heat, limit, only = null) {
     const values = layers.map((layer) => (this.number ? heat(layer, this.number) : layer.relevancy));
     const quarter = this.count / FAN;
     for (let i = 0; i < this.count; i++) {
@@ -47,7 +47,7 @@ export class Part {
       const warmth = chosen && (best - chosen.threshold) / Math.max(chosen.peak - chosen.threshold, 1e-6);
       const share = chosen ? HEAT * (0.5 + 0.5 * Math.min(warmth, 1)) : 0;
       for (let k = 0; k < 3; k++) this.bytes[16 * i + k] = this.plain[4 * i + k] * (1 - share) + (chosen?.color[k] ?? 0) * share;
-      const hidden = this.floats?.[i] > limit || this.covered[Math.floor(i / quarter)];
+      const hidden = this.floats?.[i] > limit || this.covered[Math.floor(i / quarter)] || (only && !only.has(this.root(i)));
       this.bytes[16 * i + 3] = hidden ? 0 : this.plain[4 * i + 3];
     }
     this.upload();

@@ -78,7 +78,7 @@ export class View extends EventTarget {
 
   /** Show heat: layers of { relevancy, threshold, peak, color }, the strongest where several match. */
   recolor(layers = []) {
-    const told = [this.limit, ...layers.flatMap(({ relevancy, threshold, color }) => [relevancy, threshold, color])];
+    const told = [this.limit, this.only, ...layers.flatMap(({ relevancy, threshold, color }) => [relevancy, threshold, color])];
     if (!this.root || (told.length === this.layers?.length && told.every((value, k) => value === this.layers[k]))) return;
     Object.assign(this, { layers: told, shown: layers });
     for (const number of this.parts.keys()) this.repaint(number);
@@ -86,7 +86,7 @@ export class View extends EventTarget {
   }
 
   repaint(number) {
-    this.parts.get(number)?.paint(this.shown ?? [], this.heat, this.limit);
+    this.parts.get(number)?.paint(this.shown ?? [], this.heat, this.limit, this.only);
     this.wake();
   }
 

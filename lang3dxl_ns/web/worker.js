@@ -5,12 +5,13 @@ import { boxAround, massOf, rankViews, readViews } from "./find.js";
 import { likeness } from "./like.js";
 import { bestPhoto, gaussiansAt, middleOf, unpackSplats } from "./pick.js";
 import { freeSpace } from "./space.js";
+import { isPresent, Known, thingsOf } from "./things.js";
 import { ancestry, FAN } from "./tree.js";
 import { Vocabulary } from "./vocabulary.js";
 
 const EXAMPLE = 5; // number of Gaussians that represent a clicked place
 const INSIDE = 60; // Gaussians that represent an outlined place
-let about, answers, vocabulary, geometry, views, mass, field;
+let about, answers, vocabulary, geometry, views, mass, field, known;
 const parts = new Map(); // of the scene, by number: { geometry, opacities, floats, answers, root }; chunk 0 is the whole scene
 let limit = 255;
 
@@ -91,12 +92,14 @@ const jobs = {
     const rows = await rowsOf(await bytes(words.field ? "codes.bin" : "rows.bin"), words.count, tell);
     answers = new Answers(rows, vocabulary, words);
     geometry = unpackSplats(splats);
+    geometry.bytes = new Uint8Array(splats);
     hold(0, geometry, answers, null);
     views = readViews(about, await bytes("views.bin")).map((view) => ({
       ...view,
       pose: view.pose.map((row, axis) => (axis < 3 ? [...row.slice(0, 3), row[3] - about.center[axis]] : row)),
     }));
     mass = massOf(views, words.count);
+    known = new Known(mass);
     answers.foreground = await foregroundOf(about.foreground);
     return { seconds: (performance.now() - start) / 1000, known: vocabulary.words.length };
   },
@@ -141,6 +144,14 @@ const jobs = {
       views: rankViews(views, geometry.centers, relevancy, threshold),
       box: box && { low: moved(box.low), high: moved(box.high) },
     };
+  },
+
+  /** Find the single things of an answer: { things, least, most }. */
+  things({ relevancy }) {
+    if (!isPresent(relevancy, about.words.rules)) return { things: [], least: 0, most: 0 };
+    const found = thingsOf(views, { ...geometry, mass, gap: about.words.gap, up: about.up }, relevancy);
+    const things = found.things.map((thing) => ({ ...thing, id: known.id(thing), center: thing.center.map((value, axis) => value + about.center[axis]) }));
+    return { ...found, things };
   },
 
   /** Find the words that match a pixel best, and its Gaussians; none where too few of them have a meaning. */

@@ -33,6 +33,7 @@ from lang3dxl_ns.query.thresholds import EVEN, SHARE
 from lang3dxl_ns.query.trust import ALIKE, ANCHORS, CLEARLY, FAINT, FAR, STRICTER, STRICTEST
 from lang3dxl_ns.query.visibility import spread
 from lang3dxl_ns.query.vocabulary import closest_word, common_words, same_thing, shipped_vocabulary
+from lang3dxl_ns.things import find, grammar, join, pieces, thing
 from lang3dxl_ns.web.levels import MOST_ROWS, SMALL, Levels, levels_of
 from lang3dxl_ns.web.pack import (
     LEAST_PIXELS,
@@ -70,6 +71,14 @@ _SUGGESTED = (
 )  # fmt: skip
 """Words that a first visitor is offered, where the scene knows them."""
 _RANKING = ("PEAK", "LARGE", "RIM", "STRONG", "CORE", "JOINED", "OUTLIERS", "DENSE")
+_THINGS = (
+    (pieces, "LEVELS PART DEPTH"),
+    (join, "SHARED SPLINTER VIEWS CRUMB MOST_SHARED"),
+    (thing, "OUTLIERS TURNS"),
+    (find, "COLORED SAME"),
+    (grammar, "BESIDE INSIDE"),
+)
+"""Numbers that tell things apart and relate them, by the modules that hold them."""
 _TEXTS = 256
 """Number of texts encoded at a time."""
 _DATA = re.compile(
@@ -339,6 +348,8 @@ def language_module() -> bytes:
     """Write the table of what people type, and the numbers by which views are ranked, as a module."""
     table = {name: value for name, value in TABLE.items() if name != "cases"}
     table["ranking"] = {name: getattr(view_ranking, name) for name in _RANKING}
+    table["grammar"] = grammar.table()
+    table["things"] = {name: getattr(module, name) for module, names in _THINGS for name in names.split()}
     return f"export default {json.dumps(table, ensure_ascii=False)};\n".encode()
 
 

@@ -2,11 +2,12 @@
 
 import numpy as np
 import pytest
+from painted_scene import painted_scene
 
 from lab.landmark.instances import true_things
 from lab.landmark.landmark import Landmark
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.things.find import Things
+from lang3dxl_ns.things.find import Things, things_of
 from lang3dxl_ns.things.grammar import Request, Sight, answer, parse, table
 from lang3dxl_ns.things.join import join, without_crumbs
 from lang3dxl_ns.things.pieces import Piece, Shown, pieces_of, split
@@ -149,3 +150,12 @@ def test_true_things_hold_each_solid_once(family, seed):
             center = things[number].center
             margin = things[number].size.max()
             assert (center > corners.min(0) - margin).all() and (center < corners.max(0) + margin).all()
+
+
+def test_a_thing_keeps_its_id_in_later_questions_and_under_other_words():
+    scene = painted_scene()
+    (first,), (again, _) = things_of(scene, "windows"), things_of(scene, ["window", "dome"])
+    assert len(first.things) == 2
+    assert {one.id for one in first.things} == {one.id for one in again.things}
+    (alone,) = things_of(painted_scene(), "window")
+    assert {one.id for one in alone.things} == {one.id for one in first.things}

@@ -1,0 +1,105 @@
+// Questions about things: counts, superlatives, ordinals and relations, as in Python's things/grammar.py.
+import language from "./language.js";
+
+const { grammar } = language, { BESIDE, INSIDE } = language.things;
+const has = (table, word) => Object.hasOwn(table, word);
+const any = (phrases) => [...(Array.isArray(phrases) ? phrases : Object.keys(phrases))].sort((a, b) => b.length - a.length).join("|");
+const plain = (text) => text.trim().replace(new RegExp(`^(?:(?:${any(grammar.articles)})\\s+)+`), "");
+
+/** Parse a question: { word, count, superlative, nth, along, relation, others, without }. Throws an error, which names
+ * the part, for what the grammar doesn't know. */
+export function parse(text) {
+  let rest = text.toLowerCase().replace(/^[ ?!.]+|[ ?!.]+$/g, "").split(/\s+/).filter(Boolean).join(" ");
+  const asked = { word: "", count: false, superlative: null, nth: null, along: null, relation: null, others: [], without: null };
+  const cut = (pattern) => rest !== (rest = rest.replace(pattern, ""));
+  asked.count = cut(new RegExp(`^(?:${any(grammar.count)})\\s+`));
+  cut(new RegExp(`^(?:${any(grammar.lead)})\\s+`));
+  cut(new RegExp(`\\s+(?:${any(grammar.tail)})$`));
+  let found = /^(.+?) (?:but )?not (.+)$/.exec(rest);
+  if (found) [rest, asked.without] = [found[1], plain(found[2])];
+  found = new RegExp(`^(.+?) (${any(grammar.relations)}) (.+)$`).exec(rest);
+  if (found) {
+    [rest, asked.relation, asked.others] = [found[1], grammar.relations[found[2]], found[3].split(/\s+and\s+/).map(plain)];
+    if (asked.others.length > (asked.relation === "between" ? 2 : 1)) throw new Error(`${found[2]} ${found[3]}: name one thing, or two with between … and …`);
+  }
+  found = new RegExp(`^(.+?) (?:from|on) the (${any(grammar.from)})$`).exec(rest);
+  if (found) [rest, asked.along] = [found[1], found[2]];
+  rest = plain(rest);
+  const [, first, noun] = /^(\S+) (.+)$/.exec(rest) ?? [];
+  if (noun && has(grammar.superlatives, first)) [asked.superlative, rest] = [first, noun];
+  else if (noun && (has(grammar.ordinals, first) || /^\d+(st|nd|rd|th)$/.test(first))) {
+    [asked.nth, rest] = [grammar.ordinals[first] ?? parseInt(first), noun];
+    if (!asked.along || asked.nth < 1) throw new Error(`${first} ${noun}: say from which side, such as the ${first} ${noun} from the left`);
+  }
+  if (asked.along && !asked.nth) throw new Error(`from the ${asked.along}: say which one, such as the second ${rest} from the ${asked.along}`);
+  for (const name of [rest, ...asked.others, ...(asked.without === null ? [] : [asked.without])]) checkName(name);
+  return { ...asked, word: rest };
+}
+
+function checkName(name) {
+  if (!name) throw new Error("this names no thing: ask for one, such as how many windows");
+  const words = name.split(" "), unused = words.filter((word) => grammar.unknown.includes(word) || has(grammar.ordinals, word));
+  unused.push(...words.filter((word) => has(grammar.superlatives, word)), ...(name.match(new RegExp(`\\b(?:${any(grammar.relations)})\\b`, "g")) ?? []));
+  if (!unused.length) return;
+  throw new Error(`${name}: a question can't use ${[...new Set(unused)].join(", ")} here; ask how many windows, for the highest tower, ` +
+    "the third window from the left, or windows above the portal"); // prettier-ignore
+}
+
+/** Whether what was typed asks more than where something is. */
+export function isQuestion(text) {
+  try {
+    const { count, superlative, nth, relation } = parse(text);
+    return Boolean(count || superlative || nth || relation);
+  } catch {
+    return new RegExp(`^(?:${any(grammar.count)}|what|which|why|who|when)\\s`, "i").test(text.trim()); // the grammar says why it has no answer
+  }
+}
+
+export const wordsOf = ({ word, others, without }) => [...new Set([word, ...others, ...(without ? [without] : [])])];
+
+/** Choose the things that a request asks for. things: those of each word; view: { right, up, ahead }. Throws an error if
+ * a thing that the relation refers to is not found, or if there are fewer than the ordinal asks for. */
+export function answerTo(request, things, view) {
+  const { word, relation, others, superlative, nth, along, without } = request;
+  let chosen = things[word];
+  if (without) chosen = chosen.filter(({ id }) => !things[without].some((other) => other.id === id));
+  if (relation) {
+    for (const other of others) if (!things[other].length) throw new Error(`no ${other} found: a relation to it has no answer`);
+    chosen = chosen.filter((thing) => related(thing, relation, others.map((other) => things[other]), view)); // prettier-ignore
+  }
+  const ordered = ([kind, sign]) => [...chosen].sort((a, b) => sign * (measure(a, kind, view) - measure(b, kind, view)));
+  if (superlative) return ordered(grammar.superlatives[superlative]).slice(0, 1);
+  if (!nth) return chosen;
+  if (chosen.length < nth) throw new Error(`only ${chosen.length} ${word} found: there is no number ${nth}`);
+  return ordered(grammar.from[along]).slice(nth - 1, nth);
+}
+
+const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+const minus = (a, b) => a.map((value, axis) => value - b[axis]);
+
+function measure({ center, size }, kind, view) {
+  if (kind === "left") return dot(center, view.right);
+  if (kind === "top") return dot(center, view.up) + size[2] / 2;
+  return { tall: size[2], wide: Math.max(size[0], size[1]) }[kind] ?? size[0] * size[1] * size[2];
+}
+
+function related(thing, relation, others, view) {
+  if (relation !== "between") return others[0].some((other) => other.id !== thing.id && holds(thing, relation, other, view));
+  const apart = (a, b) => a.id !== b.id && thing.id !== a.id && thing.id !== b.id;
+  return others[0].some((a) => others.at(-1).some((b) => apart(a, b) && between(thing, a, b)));
+}
+
+function holds(thing, relation, other, view) {
+  const apart = minus(thing.center, other.center), wide = Math.max(other.size[0], other.size[1]), most = (values) => Math.max(...values);
+  const along = { left: -dot(apart, view.right), right: dot(apart, view.right), front: -dot(apart, view.ahead), behind: dot(apart, view.ahead) };
+  if (relation in along) return along[relation] > wide / 2;
+  if (relation === "above" || relation === "below") return dot(apart, view.up) * (relation === "above" ? 1 : -1) > other.size[2] / 2;
+  if (relation === "beside") return Math.hypot(...apart) < (BESIDE * (most(thing.size) + most(other.size))) / 2;
+  return other.axes.every((axis, k) => Math.abs(dot(axis, apart)) <= INSIDE * Math.max(other.size[k], most(other.size) / 10));
+}
+
+function between(thing, a, b) {
+  const line = minus(b.center, a.center), from = minus(thing.center, a.center), share = dot(from, line) / Math.max(dot(line, line), 1e-12);
+  const aside = Math.hypot(...from.map((value, axis) => value - share * line[axis]));
+  return 0 < share && share < 1 && aside < Math.max(...a.size, ...b.size);
+}

@@ -1,0 +1,198 @@
+// The list of a word's things: how many were found, one after the other, their boxes, and questions about them.
+import { element, shown } from "./cards.js";
+import { answerTo, parse, wordsOf } from "./grammar.js";
+import { Vector3 } from "./library.js";
+
+const NAMESPACE = "http://www.w3.org/2000/svg", CORNERS = [0, 1, 2, 3, 4, 5, 6, 7];
+const FILLED = 0.35, NARROW = 15, WIDE = 60; // share of the window that a thing fills after a flight; degrees of the lens
+const GAP = 4, LETTER = 8, LINE = 18; // pixels between labels, per letter, and of a line
+
+const count = ({ things, least, most }) => (least === most ? `${things.length}` : `${things.length}, perhaps ${Math.min(least, things.length)} to ${Math.max(most, things.length)}`);
+
+export class List extends EventTarget {
+  /** about: the page's description; think: gives the worker a job; view, prompts: what is shown. Fires `change` when
+   * the list, or what is chosen in it, has changed. */
+  constructor(about, think, view, prompts) {
+    super();
+    Object.assign(this, { about, think, view, prompts, chosen: null, alone: false, wanted: null });
+  }
+
+  /** Find a prompt's things, once for each of its answers; resolves to { things, least, most }. */
+  async find(prompt) {
+    const { turn, relevancy } = prompt;
+    if (prompt.counting?.turn !== turn) prompt.counting = { turn, found: this.think("things", { relevancy }) };
+    const found = await prompt.counting.found;
+    if (prompt.turn !== turn || prompt.found === found) return found;
+    prompt.found = found;
+    if (this.chosen?.prompt === prompt) this.forget();
+    const again = this.wanted && found.things.find(({ id, rows }) => id === this.wanted.id || rows.includes(this.wanted.id));
+    if (again && this.wanted.word === prompt.text) this.take(prompt, again, this.wanted.alone);
+    this.dispatchEvent(new Event("change"));
+    return found;
+  }
+
+  /** Find the things of all prompts that are answered. */
+  findAll() {
+    for (const prompt of this.prompts) if (prompt.relevancy && !prompt.dragged) this.find(prompt).catch(() => {});
+  }
+
+  /** Build the part of a prompt's card that lists its things; null before they are found. */
+  part(prompt) {
+    if (!prompt.found) return null;
+    const { things } = prompt.found, small = (label, act, more) => element("button", { className: "small", onclick: act, ...more }, label);
+    const summary = element("summary", {}, things.length ? `${count(prompt.found)} found` : "No single things found");
+    const made = element("details", { className: "things", open: Boolean(prompt.listed) }, summary);
+    summary.addEventListener("click", (event) => {
+      event.preventDefault();
+      prompt.listed = !prompt.listed;
+      if (!prompt.listed && this.chosen?.prompt === prompt) this.leave();
+      this.dispatchEvent(new Event("change"));
+    });
+    if (!prompt.listed || !things.length) return made;
+    const own = this.chosen?.prompt === prompt, listed = element("ol", { ariaLabel: `Things: ${shown(prompt.text)}` });
+    things.forEach((thing, k) => {
+      const ask = { ariaLabel: `${shown(prompt.text)} ${k + 1}`, ariaPressed: String(own && this.chosen.thing === thing) };
+      listed.append(element("li", { className: prompt.asked?.has(thing.id) ? "asked" : "" }, small(`${k + 1}`, () => this.choose(prompt, thing), ask)));
+    });
+    made.append(element("div", {}, small("‹", () => this.step(-1, prompt), { ariaLabel: "Previous thing" }), small("›", () => this.step(1, prompt), { ariaLabel: "Next thing" }),
+      small("Hide the rest", () => this.hideRest(!this.alone), { ariaPressed: String(own && this.alone), disabled: !own })), listed); // prettier-ignore
+    return made;
+  }
+
+  // ── choosing ──
+
+  /** Choose a thing, and fly to it. */
+  choose(prompt, thing) {
+    this.take(prompt, thing, this.alone);
+    const photo = this.about.views[thing.seen[0]?.view];
+    if (photo) {
+      const { position } = this.view.mover.standing(photo), target = new Vector3(...thing.center), size = Math.max(...thing.size);
+      const fov = (360 / Math.PI) * Math.atan(size / FILLED / 2 / Math.max(position.distanceTo(target), 1e-6));
+      this.view.mover.walk(false);
+      this.view.mover.fly({ position, target, fov: Math.max(NARROW, Math.min(fov, WIDE)) });
+    }
+    this.dispatchEvent(new Event("change"));
+  }
+
+  take(prompt, thing, alone) {
+    Object.assign(this, { chosen: { prompt, thing }, wanted: null });
+    prompt.listed = true;
+    this.hideRest(alone);
+  }
+
+  /** Choose nothing any more; returns whether something was chosen. */
+  leave() {
+    const before = this.chosen;
+    Object.assign(this, { chosen: null, wanted: null });
+    this.hideRest(false);
+    return Boolean(before);
+  }
+
+  /** Choose nothing any more, before the next drawing. */
+  forget() {
+    Object.assign(this, { chosen: null, alone: false });
+    this.view.only = null;
+  }
+
+  /** Forget the chosen thing if its prompt is gone. */
+  tidy() {
+    if (this.chosen && !this.prompts.includes(this.chosen.prompt)) this.forget();
+  }
+
+  /** Show the chosen thing alone, or everything. */
+  hideRest(alone) {
+    this.alone = Boolean(alone && this.chosen);
+    this.view.only = this.alone ? new Set(this.chosen.thing.rows) : null;
+    this.view.recolor(this.view.shown);
+    this.dispatchEvent(new Event("change"));
+  }
+
+  /** Choose the next thing of a list, or of those that were asked for. */
+  step(by, prompt = this.chosen?.prompt ?? this.prompts.find(({ found }) => found?.things.length)) {
+    const { things = [] } = prompt?.found ?? {}, asked = things.filter(({ id }) => !prompt.asked || prompt.asked.has(id));
+    const here = asked.indexOf(this.chosen?.thing), next = here < 0 ? (by > 0 ? 0 : asked.length - 1) : (here + by + asked.length) % asked.length;
+    if (asked.length) this.choose(prompt, asked[next]);
+  }
+
+  /** Choose the thing that shows these Gaussians, among the lists that are open; returns whether there is one. */
+  pick(rows) {
+    for (const prompt of this.prompts.filter(({ listed, found }) => listed && found)) {
+      const thing = prompt.found.things.find((one) => rows.some((row) => one.rows.includes(row)));
+      if (thing) return this.choose(prompt, thing), true;
+    }
+    return false;
+  }
+
+  /** The chosen thing as fields of an address, and back. */
+  get fields() {
+    const { prompt, thing } = this.chosen ?? {};
+    return thing ? { thing: `${thing.id} ${prompt.text}`, alone: this.alone ? 1 : "" } : {};
+  }
+
+  set fields({ thing, alone }) {
+    const [, id, word] = /^(\d+) (.+)$/.exec(thing ?? "") ?? [];
+    this.leave();
+    if (!word) return;
+    this.wanted = { id: Number(id), word, alone: alone === "1" };
+    for (const prompt of this.prompts) delete prompt.found; // looked up anew among those that are known
+  }
+
+  // ── questions ──
+
+  /** Answer a question, such as "highest tower". ask: answers a prompt, and resolves to whether its words are known.
+   * Resolves to the answer in words; null if some word is unknown. */
+  async question(typed, ask) {
+    const request = parse(typed), words = wordsOf(request), things = {};
+    for (const word of words) if (!(await ask(word))) return null;
+    const asked = words.map((word) => this.prompts.find(({ text }) => text === word));
+    if (!asked.every(Boolean)) return null;
+    for (const prompt of asked) things[prompt.text] = (await this.find(prompt)).things;
+    const chosen = answerTo(request, things, this.directions), [first] = asked, every = chosen.length === things[request.word].length;
+    Object.assign(first, { listed: true, asked: every ? null : new Set(chosen.map(({ id }) => id)) });
+    const sure = asked.every(({ trust }) => trust.level === "sure") ? "" : " Not sure: see the cards.";
+    if (request.count) {
+      this.dispatchEvent(new Event("change"));
+      return `${every ? count(first.found) : chosen.length} ${shown(request.word)}.${sure}`;
+    }
+    if (chosen.length) this.choose(first, chosen[0]);
+    else this.dispatchEvent(new Event("change"));
+    const numbers = chosen.map((thing) => things[request.word].indexOf(thing) + 1).join(", ");
+    return (chosen.length ? `${shown(request.word)} ${numbers}.` : `No ${shown(request.word)} fit.`) + sure;
+  }
+
+  /** Directions of the viewer: right, up and ahead. */
+  get directions() {
+    const up = new Vector3(...this.about.up), ahead = this.view.camera.getWorldDirection(new Vector3());
+    ahead.addScaledVector(up, -ahead.dot(up)).normalize();
+    return { right: ahead.clone().cross(up).toArray(), up: up.toArray(), ahead: ahead.toArray() };
+  }
+
+  // ── boxes and labels ──
+
+  /** Draw the boxes of the lists that are open, with numbers that don't overlap; the chosen one comes first. */
+  outlines() {
+    const drawn = [], taken = [];
+    for (const prompt of this.prompts.filter(({ listed, found }) => listed && found)) {
+      prompt.found.things.forEach((thing, k) => drawn.push({ prompt, thing, label: `${k + 1}`, own: thing === this.chosen?.thing, asked: !prompt.asked || prompt.asked.has(thing.id) }));
+    }
+    return drawn.sort((a, b) => b.own - a.own || b.asked - a.asked).flatMap((one) => this.outline(one, taken));
+  }
+
+  outline({ prompt, thing: { center, axes, size }, thing, label, own, asked }, taken) {
+    const corners = CORNERS.map((c) => this.view.pixel(center.map((value, k) => axes.reduce((sum, axis, a) => sum + axis[k] * size[a] * (((c >> a) & 1) - 0.5), value))));
+    if (!corners.every(Boolean)) return [];
+    const edges = CORNERS.flatMap((k) => [1, 2, 4].filter((step) => !(k & step)).map((step) => `M${corners[k]}L${corners[k + step]}`));
+    const path = document.createElementNS(NAMESPACE, "path"), text = document.createElementNS(NAMESPACE, "text");
+    path.setAttribute("d", edges.join(""));
+    const [x, y] = corners.reduce((best, corner) => (corner[1] < best[1] ? corner : best)), word = own ? `${shown(prompt.text)} ${label}` : label;
+    const half = (LETTER * word.length) / 2, place = [x - half, y - 6 - LINE, x + half, y - 6];
+    const free = taken.every((other) => place[0] > other[2] + GAP || other[0] > place[2] + GAP || place[1] > other[3] + GAP || other[1] > place[3] + GAP);
+    for (const part of [path, text]) part.style.setProperty("--color", `rgb(${prompt.color})`), part.classList.add("thing", ...(own ? ["chosen"] : asked ? [] : ["aside"])); // prettier-ignore
+    if (!free) return [path];
+    taken.push(place);
+    [["x", x], ["y", y - 6]].forEach(([name, value]) => text.setAttribute(name, value));
+    text.textContent = word;
+    text.addEventListener("click", () => this.choose(prompt, thing));
+    return [path, text];
+  }
+}

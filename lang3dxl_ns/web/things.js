@@ -1,0 +1,310 @@
+// Single things out of a word's relevancy, as in Python's things/: pieces of each view, joined by shared Gaussians.
+// Python renders the heat that is cut into pieces; here it is drawn from the pixels that each Gaussian fills.
+import language from "./language.js";
+
+const { LEVELS, PART, DEPTH, SHARED, SPLINTER, VIEWS, CRUMB, MOST_SHARED, OUTLIERS, TURNS, COLORED, SAME } = language.things;
+const SIDE = 240, LEAST = 3; // pixels of a view's longer side, and of the smallest piece
+const FAINT = 0.05, TRACE = 0.004, REACH = 2.5, BLUR = 0.3; // relevancy and heat that leave no trace, standard deviations that are drawn, square pixels
+const SHARP = 10, ROUNDS = 12; // inverse strength of the colors' regularization, Newton steps
+const DC = 0.28209479177387814; // of spherical harmonics: colors are compared as coefficients
+
+/** Find the things of a word: { things, least, most }, largest first. views: as of find.js; scene: { centers, axes,
+ * bytes (packed splats), mass, gap, up }, in one frame. */
+export function thingsOf(views, scene, relevancy) {
+  const heat = sharpened(scene, relevancy), { mass } = scene;
+  const weight = Float64Array.from(relevancy, (value, i) => Math.sqrt(mass[i]) * value);
+  const candidates = join(views.flatMap((view, v) => piecesOf(drawn(view, scene, heat), v)), weight);
+  const joined = withoutCrumbs(candidates), sure = joined.filter((one) => photosOf(one).size >= VIEWS);
+  const things = sure.map((one) => described(one, scene, weight, relevancy)).sort((a, b) => b.weight - a.weight);
+  return { things, least: joined.filter((one) => photosOf(one).size > VIEWS).length, most: candidates.length };
+}
+
+/** Return whether a word's peak reaches the lowest level: one that stays below names nothing here. */
+export function isPresent(relevancy, { best }) {
+  const sorted = relevancy.slice().sort(), top = Math.max(Math.ceil(best * sorted.length), 1);
+  return sorted.slice(-top).reduce((sum, value) => sum + value, 0) / top > LEVELS[0];
+}
+
+/** Things that were found before: one keeps its id whatever word finds it. */
+export class Known {
+  constructor(mass) {
+    Object.assign(this, { mass, things: [] });
+  }
+
+  id({ id, rows }) {
+    const total = (some) => some.reduce((sum, i) => sum + this.mass[i], 0), own = new Set(rows), size = total(rows);
+    for (const other of this.things) {
+      const shared = total(other.rows.filter((i) => own.has(i)));
+      if (shared > SAME * (size + other.size - shared)) return other.id;
+    }
+    this.things.push({ id, rows, size });
+    return id;
+  }
+}
+
+const photosOf = ({ votes }) => new Set(votes.map(({ view }) => view));
+
+function described({ rows, weight, votes }, { centers, mass, up }, weights, relevancy) {
+  let id = rows[0], heavy = 0, sum = 0;
+  for (const i of rows) {
+    if (mass[i] > mass[id]) id = i;
+    heavy += Math.max(mass[i], 1e-9);
+    sum += Math.max(mass[i], 1e-9) * relevancy[i];
+  }
+  const best = new Map();
+  for (const piece of [...votes].sort((a, b) => a.cut - b.cut || b.area - a.area)) if (!best.has(piece.view)) best.set(piece.view, piece.box);
+  const seen = [...best].map(([view, box]) => ({ view, box }));
+  return { id, weight, score: sum / heavy, rows: Uint32Array.from(rows).sort(), seen, ...uprightBox(rows, centers, weights, up) };
+}
+
+// ── heat ──
+
+/** Multiply relevancies by how much a color is that of the matches, and not of what is around them. */
+export function sharpened({ centers, bytes, mass, gap }, relevancy) {
+  const match = [], around = [];
+  for (let i = 0; i < relevancy.length; i++) if (relevancy[i] > 0.9 && mass[i] > 0) match.push(i);
+  if (match.length < COLORED) return relevancy;
+  const near = neighborhood(centers, match, gap);
+  for (let i = 0; i < relevancy.length; i++) if (relevancy[i] < 0.5 && mass[i] > 0 && near(i)) around.push(i);
+  if (around.length < COLORED) return relevancy;
+  const color = (i) => [...[0, 1, 2].map((k) => (bytes[16 * i + k] / 255 - 0.5) / DC), 1];
+  const total = (rows) => rows.reduce((sum, i) => sum + Math.sqrt(mass[i]), 0), all = match.length + around.length;
+  const samples = [match, around].flatMap((rows, other) => {
+    const share = all / 2 / total(rows);
+    return rows.map((i) => ({ x: color(i), y: 1 - other, w: Math.sqrt(mass[i]) * share }));
+  });
+  const beta = logistic(samples);
+  return relevancy.map((value, i) => (value > FAINT ? value / (1 + Math.exp(-color(i).reduce((sum, x, k) => sum + x * beta[k], 0))) : 0));
+}
+
+/** Return a function that tells whether a Gaussian lies within a distance of one of these rows. */
+function neighborhood(centers, rows, distance) {
+  const cells = new Map(), cell = (i, axis) => Math.floor(centers[3 * i + axis] / distance), key = (x, y, z) => (x * 2097143 + y) * 2097143 + z; // numbers, since texts are slow
+  for (const i of rows) {
+    const at = key(cell(i, 0), cell(i, 1), cell(i, 2));
+    if (cells.has(at)) cells.get(at).push(i);
+    else cells.set(at, [i]);
+  }
+  const close = (i) => (j) => (centers[3 * i] - centers[3 * j]) ** 2 + (centers[3 * i + 1] - centers[3 * j + 1]) ** 2 + (centers[3 * i + 2] - centers[3 * j + 2]) ** 2 <= distance ** 2;
+  return (i) => {
+    const [x, y, z] = [cell(i, 0), cell(i, 1), cell(i, 2)], here = close(i);
+    for (let a = -1; a <= 1; a++)
+      for (let b = -1; b <= 1; b++)
+        for (let c = -1; c <= 1; c++) if (cells.get(key(x + a, y + b, z + c))?.some(here)) return true;
+    return false;
+  };
+}
+
+/** Fit a logistic regression by Newton's method; the last coefficient is the intercept. */
+function logistic(samples) {
+  const beta = [0, 0, 0, 0];
+  for (let round = 0; round < ROUNDS; round++) {
+    const slope = beta.map((b, k) => (k < 3 ? b / SHARP : 0)), bend = beta.map((_, k) => beta.map((_, j) => (k === j ? (k < 3 ? 1 / SHARP : 1e-9) : 0)));
+    for (const { x, y, w } of samples) {
+      const p = 1 / (1 + Math.exp(-(x[0] * beta[0] + x[1] * beta[1] + x[2] * beta[2] + beta[3]))), curve = w * p * (1 - p);
+      for (let k = 0; k < 4; k++) {
+        slope[k] += w * (p - y) * x[k];
+        for (let j = 0; j < 4; j++) bend[k][j] += curve * x[k] * x[j];
+      }
+    }
+    solve(bend, slope).forEach((step, k) => (beta[k] -= step));
+  }
+  return beta;
+}
+
+/** Solve a small symmetric positive definite system by elimination. */
+function solve(matrix, right) {
+  const size = right.length, rows = matrix.map((row, k) => [...row, right[k]]);
+  for (let k = 0; k < size; k++)
+    for (let j = 0; j < size; j++) {
+      if (j === k) continue;
+      const share = rows[j][k] / rows[k][k];
+      for (let c = k; c <= size; c++) rows[j][c] -= share * rows[k][c];
+    }
+  return rows.map((row, k) => row[size] / row[k]);
+}
+
+/** Draw a view's heat and depth: what each Gaussian fills, spread over its footprint. */
+export function drawn(view, { centers, axes }, heat) {
+  const scale = Math.min(1, SIDE / Math.max(view.width, view.height)), { rows, codes, sizes } = view;
+  const [fx, fy, cx, cy] = [view.fx, view.fy, view.cx, view.cy].map((value) => value * scale), turn = view.pose.slice(0, 3).flat();
+  const width = Math.round(view.width * scale), height = Math.round(view.height * scale), filled = width * height;
+  const map = new Float32Array(filled), depth = new Float32Array(filled), points = new Float32Array(3 * rows.length);
+  for (let n = 0; n < rows.length; n++) {
+    const i = rows[n], p = centers[3 * i] - turn[3], q = centers[3 * i + 1] - turn[7], r = centers[3 * i + 2] - turn[11];
+    const z = -(p * turn[2] + q * turn[6] + r * turn[10]), right = (p * turn[0] + q * turn[4] + r * turn[8]) / z, up = (p * turn[1] + q * turn[5] + r * turn[9]) / z;
+    const x = cx + fx * right, y = cy - fy * up;
+    (points[3 * n] = x), (points[3 * n + 1] = y), (points[3 * n + 2] = z);
+    if (heat[i] <= FAINT || !(z > 0)) continue;
+    const sideways = Math.max(-1, Math.min(right, 1)), upwards = Math.max(-1, Math.min(up, 1));
+    let uu = BLUR, uv = 0, vv = BLUR; // covariance of its footprint, square pixels
+    for (let k = 9 * i; k < 9 * i + 9; k += 3) {
+      const a = axes[k], b = axes[k + 1], c = axes[k + 2], back = turn[2] * a + turn[6] * b + turn[10] * c;
+      const u = (fx * (turn[0] * a + turn[4] * b + turn[8] * c + sideways * back)) / z, v = (-fy * (turn[1] * a + turn[5] * b + turn[9] * c + upwards * back)) / z;
+      (uu += u * u), (uv += u * v), (vv += v * v);
+    }
+    const area = uu * vv - uv * uv, most = (heat[i] * sizes[codes[n]] * filled) / (2 * Math.PI * Math.sqrt(area));
+    const wide = REACH * Math.sqrt(uu), tall = REACH * Math.sqrt(vv);
+    const first = Math.max(Math.ceil(x - wide - 0.5), 0), last = Math.min(Math.floor(x + wide - 0.5), width - 1), bottom = Math.min(Math.floor(y + tall - 0.5), height - 1);
+    if (most < TRACE) continue;
+    for (let row = Math.max(Math.ceil(y - tall - 0.5), 0); row <= bottom; row++)
+      for (let column = first, dv = row + 0.5 - y; column <= last; column++) {
+        const du = column + 0.5 - x, far = (vv * du * du - 2 * uv * du * dv + uu * dv * dv) / area;
+        if (far > REACH * REACH) continue;
+        const share = most * Math.exp(-far / 2), at = row * width + column;
+        map[at] += share;
+        depth[at] += share * z;
+      }
+  }
+  for (let at = 0; at < filled; at++) if (map[at] > 0) depth[at] /= map[at];
+  return { map, depth, width, height, rows, points, focal: fx, scale };
+}
+
+// ── pieces ──
+
+/** Find the pieces of a map that is drawn, with the Gaussians that each one shows. */
+export function piecesOf({ map, depth, width, height, rows, points, focal, scale }, view) {
+  const { labels, pieces } = split(map, width, height), own = pieces.map(() => []);
+  for (let k = 0; k < rows.length; k++) {
+    const x = points[3 * k], y = points[3 * k + 1], z = points[3 * k + 2];
+    if (!(x >= 0 && x < width && y >= 0 && y < height)) continue;
+    const at = Math.floor(y) * width + Math.floor(x);
+    if (labels[at] && Math.abs(z - depth[at]) < DEPTH * z) own[labels[at] - 1].push(rows[k]);
+  }
+  return pieces.flatMap((pixels, k) => {
+    if (!own[k].length) return [];
+    const depths = Float32Array.from(pixels, (p) => depth[p]).sort(), half = depths.length >> 1;
+    const middle = depths.length % 2 ? depths[half] : (depths[half - 1] + depths[half]) / 2;
+    let [left, top, right, bottom] = [width, height, 0, 0];
+    for (const p of pixels) {
+      const [x, y] = [p % width, Math.floor(p / width)];
+      (left = Math.min(left, x)), (top = Math.min(top, y)), (right = Math.max(right, x + 1)), (bottom = Math.max(bottom, y + 1));
+    }
+    const cut = left <= 1 || top <= 1 || right >= width - 1 || bottom >= height - 1;
+    return [{ view, rows: own[k], resolution: focal / middle, area: pixels.length, box: [left, top, right, bottom].map((side) => side / scale), cut }];
+  });
+}
+
+/** Number the pieces of a map from 1, and list the pixels of each. */
+export function split(map, width, height, least = LEAST) {
+  const labels = new Int32Array(map.length), pieces = [], stamps = new Int32Array(map.length);
+  let stamp = 0;
+  const parts = (pixels, level) => {
+    const open = ++stamp, found = [];
+    for (const p of pixels) if (map[p] > level) stamps[p] = open;
+    for (const start of pixels) {
+      if (stamps[start] !== open) continue;
+      const part = [start];
+      stamps[start] = 0;
+      for (let k = 0; k < part.length; k++) {
+        const p = part[k], x = p % width, y = Math.floor(p / width);
+        const next = [x > 0 ? p - 1 : -1, x < width - 1 ? p + 1 : -1, y > 0 ? p - width : -1, y < height - 1 ? p + width : -1];
+        for (const q of next) if (q >= 0 && stamps[q] === open) (stamps[q] = 0), part.push(q);
+      }
+      found.push(part);
+    }
+    return found;
+  };
+  const leaves = (region, level) => {
+    if (level === LEVELS.length) return [region];
+    const large = parts(region, LEVELS[level]).filter((part) => part.length >= Math.max(least, PART * region.length));
+    const found = large.flatMap((part) => leaves(part, level + 1));
+    return found.length > 1 ? found : [region];
+  };
+  const everywhere = [];
+  for (let p = 0; p < map.length; p++) if (map[p] > LEVELS[0]) everywhere.push(p);
+  for (const region of parts(everywhere, LEVELS[0])) if (region.length >= least) pieces.push(...leaves(region, 1));
+  pieces.forEach((pixels, k) => pixels.forEach((p) => (labels[p] = k + 1)));
+  return { labels, pieces };
+}
+
+// ── things ──
+
+/** Join the pieces of all views, from the finest resolution to the coarsest: see things/join.py. */
+export function join(pieces, weight) {
+  const owner = new Int32Array(weight.length).fill(-1), things = [], together = [];
+  for (const piece of [...pieces].sort((a, b) => a.cut - b.cut || b.resolution - a.resolution)) {
+    const shared = new Map();
+    let total = 0, taken = 0;
+    for (const i of piece.rows) {
+      total += weight[i];
+      if (owner[i] < 0) continue;
+      taken += weight[i];
+      shared.set(owner[i], (shared.get(owner[i]) ?? 0) + weight[i]);
+    }
+    if (!(total > 0)) continue;
+    const covered = [...shared].filter(([t, value]) => value > SHARED * things[t].weight).map(([t]) => t);
+    if (covered.length > 1) {
+      for (const a of covered) for (const b of covered) if (a < b) together.push([a, b]);
+      continue;
+    }
+    const [best, most] = [...shared].reduce((one, other) => (other[1] > one[1] || (other[1] === one[1] && other[0] < one[0]) ? other : one), [-1, 0]);
+    const share = best < 0 ? 0 : most / things[best].weight;
+    if (best >= 0 && (most > SHARED * total || share > SHARED)) {
+      if (share >= SPLINTER && !(piece.cut && share <= SHARED)) things[best].votes.push(piece);
+    } else if (!piece.cut && taken <= MOST_SHARED * total) {
+      const rows = piece.rows.filter((i) => owner[i] < 0);
+      for (const i of rows) owner[i] = things.length;
+      things.push({ rows, weight: rows.reduce((sum, i) => sum + weight[i], 0), votes: [piece] });
+    }
+  }
+  return united(things, together).filter(({ rows }) => rows.length > 1);
+}
+
+/** Unite the things that some piece covers together, and no photo shows apart. */
+function united(things, together) {
+  const photos = things.map(photosOf), parent = things.map((_, t) => t), root = (t) => (parent[t] === t ? t : (parent[t] = root(parent[t])));
+  for (const [a, b] of together) {
+    if ([...photos[a]].some((photo) => photos[b].has(photo))) continue;
+    const [low, high] = [root(a), root(b)].sort((x, y) => x - y);
+    parent[high] = low;
+  }
+  const groups = new Map();
+  things.forEach((thing, t) => groups.set(root(t), [...(groups.get(root(t)) ?? []), thing]));
+  return [...groups.values()].map((parts) => ({
+    rows: parts.flatMap(({ rows }) => rows), votes: parts.flatMap(({ votes }) => votes),
+    weight: parts.reduce((sum, { weight }) => sum + weight, 0),
+  })); // prettier-ignore
+}
+
+/** Leave out the things that weigh far less than the typical one. */
+export function withoutCrumbs(things) {
+  const weights = things.map(({ weight }) => weight).sort((a, b) => b - a), all = weights.reduce((sum, value) => sum + value, 0);
+  let before = 0;
+  const typical = weights.find((value) => (before += value) >= all / 2) ?? 0;
+  return things.filter(({ weight }) => weight >= CRUMB * typical);
+}
+
+/** Find the upright box with the smallest base around weighted Gaussians: { center, axes, size }. */
+export function uprightBox(rows, centers, weight, up) {
+  const cross = (a, b) => [0, 1, 2].map((k) => a[(k + 1) % 3] * b[(k + 2) % 3] - a[(k + 2) % 3] * b[(k + 1) % 3]);
+  const least = up.reduce((best, value, k) => (Math.abs(value) < Math.abs(up[best]) ? k : best), 0);
+  const flat = cross(up, [0, 1, 2].map((k) => +(k === least))), aside = flat.map((value) => value / Math.hypot(...flat)), ahead = cross(up, aside);
+  const total = rows.reduce((sum, i) => sum + weight[i], 0), values = new Float64Array(rows.length), order = Uint32Array.from(rows.keys());
+  const ends = (axis) => {
+    rows.forEach((i, k) => (values[k] = centers[3 * i] * axis[0] + centers[3 * i + 1] * axis[1] + centers[3 * i + 2] * axis[2]));
+    order.sort((a, b) => values[a] - values[b]);
+    return [OUTLIERS, 1 - OUTLIERS].map((share) => quantile(share, rows, values, order, weight, total));
+  };
+  const height = ends(up);
+  let best = null;
+  for (let turn = 0; turn < TURNS; turn++) {
+    const angle = (turn * Math.PI) / 2 / TURNS, level = aside.map((value, k) => Math.cos(angle) * value + Math.sin(angle) * ahead[k]);
+    const axes = [level, cross(up, level), up], sides = [ends(axes[0]), ends(axes[1]), height], size = sides.map(([low, high]) => high - low);
+    if (best && !(size[0] * size[1] < best.size[0] * best.size[1])) continue;
+    best = { axes, size, center: [0, 1, 2].map((k) => sides.reduce((sum, [low, high], a) => sum + ((low + high) / 2) * axes[a][k], 0)) };
+  }
+  return best;
+}
+
+/** Interpolate a weighted quantile, as numpy's interp does between the middles of the weights. */
+function quantile(share, rows, values, order, weight, total) {
+  let sum = 0, before = null;
+  for (const k of order) {
+    const at = (sum + weight[rows[k]] / 2) / total;
+    sum += weight[rows[k]];
+    if (at >= share) return before === null ? values[k] : before.value + ((values[k] - before.value) * (share - before.at)) / Math.max(at - before.at, 1e-12);
+    before = { at, value: values[k] };
+  }
+  return before.value;
+}

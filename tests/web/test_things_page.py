@@ -1,0 +1,190 @@
+"""Things in the page: the same pieces, joins, boxes and questions as Python's, a list, and addresses."""
+
+import numpy as np
+import pytest
+from painted_scene import painted_scene
+from test_web_page import DESK, browser, opened, rest, served  # noqa: F401 — browser is a fixture
+
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.things.find import Things
+from lang3dxl_ns.things.grammar import Sight, answer, parse
+from lang3dxl_ns.things.join import join, without_crumbs
+from lang3dxl_ns.things.pieces import LEAST, Piece, split
+from lang3dxl_ns.things.thing import Thing, upright_box
+from lang3dxl_ns.web.write_page import Page, write_page
+
+QUESTIONS = [
+    *("how many windows are there?", "highest tower", "the third window from the left", "rose window"),
+    *("windows left of the portal", "the window between the doors and gates", "count windows not doors"),
+    *("largest window above the portal", "2nd window from the top", "windows in front of all the towers"),
+    *("second window from the right above the portal", "rightmost window on the right of the tower"),
+    *("third window", "windows from the left", "windows between a and b and c", "", "why windows"),
+    *(
+        "how many windows are near the portal",
+        "highest first window",
+        "windows above the door below the roof",
+    ),
+]
+"""Questions that the grammar reads, and some that it refuses."""
+SIGHT = Sight(np.array([1.0, 0, 0]), np.array([0, 0, 1.0]), np.array([0, 1.0, 0]))
+
+
+@pytest.fixture(scope="module")
+def page(browser, tmp_path_factory):  # noqa: F811
+    folder = tmp_path_factory.mktemp("page")
+    write_page(Page(painted_scene()), folder)
+    with served(folder) as address:
+        page = opened(browser, address, DESK)
+        yield page
+        assert page.complaints == []
+
+
+def module(page, name: str, body: str, given=None):
+    """What a function of a module of the page returns."""
+    return page.evaluate(f"async (given) => {{ const m = await import('./{name}.js'); {body} }}", given)
+
+
+@pytest.mark.parametrize("text", QUESTIONS)
+def test_a_question_is_read_as_by_python(page, text):
+    body = "try { return m.parse(given); } catch (error) { return error.message; }"
+    found = module(page, "grammar", body, text)
+    try:
+        expected = vars(parse(text)) | {"others": list(parse(text).others)}
+    except UserError as error:
+        expected = str(error)
+    assert found == expected
+
+
+def test_questions_choose_the_things_that_python_chooses(page):
+    rng = np.random.default_rng(3)
+    words = {"window": 9, "portal": 2, "tower": 3}
+    found, number = [], 0
+    for word, count in words.items():
+        things = []
+        for _ in range(count):
+            number += 1
+            center, size = rng.uniform(0, 9, 3), rng.uniform(0.5, 3, 3)
+            things.append(Thing(number, word, 1.0, 3, center, np.eye(3), size, np.array([number])))
+        found.append(Things(word, things, count, count))
+    numbers = ("center", "axes", "size")
+    listed = {
+        one.word: [{"id": t.id, **{name: getattr(t, name).tolist() for name in numbers}} for t in one.things]
+        for one in found
+    }
+    view = {name: getattr(SIGHT, name).tolist() for name in ("right", "up", "ahead")}
+    some = 0
+    for relation in (
+        "left of",
+        "right of",
+        "above",
+        "below",
+        "next to",
+        "between",
+        "in",
+        "in front of",
+        "behind",
+    ):
+        for start in ("", "highest ", "widest ", "leftmost "):
+            text = f"{start}window {relation} the portal"
+            expected = [t.id for t in answer(parse(text), found, lambda _: SIGHT)]
+            body = "return m.answerTo(m.parse(given.text), given.things, given.view).map(({ id }) => id);"
+            assert module(page, "grammar", body, {"text": text, "things": listed, "view": view}) == expected
+            some += len(expected)
+    assert some > 20
+
+
+def numbered(labels) -> list[int]:
+    """Labels by the order in which they first occur."""
+    order = {0: 0}
+    return [order.setdefault(int(label), len(order)) for label in labels]
+
+
+def test_a_map_falls_into_the_pieces_of_python(page):
+    rng = np.random.default_rng(0)
+    y, x = np.mgrid[:40, :60]
+    bumps = [
+        np.exp(-((x - a) ** 2 + (y - b) ** 2) / c)
+        for a, b, c in rng.uniform((0, 0, 2), (60, 40, 16), (20, 3))
+    ]
+    heat = np.maximum.reduce(bumps).astype(np.float32)
+    labels, count = split(heat)
+    assert count > 4
+    body = "return [...m.split(Float32Array.from(given.heat), 60, 40, given.least).labels];"
+    found = module(page, "things", body, {"heat": heat.ravel().tolist(), "least": LEAST})
+    np.testing.assert_array_equal(numbered(found), numbered(labels.ravel()))  # in whatever order
+
+
+def test_pieces_join_as_in_python(page):
+    rng = np.random.default_rng(1)
+    pieces = []
+    for view in range(9):
+        for start in range(0, 200, 20):
+            wide = rng.choice([8, 16, 18, 38])
+            rows = np.unique(rng.integers(start, min(start + wide, 200), 30))
+            cut = bool(rng.random() < 0.1)
+            pieces.append(Piece(str(view), rows, float(rng.random()), len(rows), (0, 0, 1, 1), cut))
+    weight = rng.random(200)
+    expected = without_crumbs(join(pieces, weight))
+    given = [{"view": int(p.photo), "rows": p.rows.tolist(), "resolution": p.resolution, "cut": p.cut}
+             for p in pieces]  # fmt: skip
+    body = """return m.withoutCrumbs(m.join(given.pieces, given.weight)).map(
+      ({ rows, votes }) => [rows.toSorted((a, b) => a - b), new Set(votes.map(({ view }) => view)).size]);"""
+    found = module(page, "things", body, {"pieces": given, "weight": weight.tolist()})
+    assert len(found) > 5
+    assert sorted(found) == sorted([sorted(one.rows.tolist()), one.views] for one in expected)
+
+
+def test_boxes_are_those_of_python(page):
+    rng = np.random.default_rng(2)
+    for angle in (0.0, 0.4, 1.3):
+        c, s = np.cos(angle), np.sin(angle)
+        points = (rng.normal(size=(300, 3)) * (3, 1, 2)) @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
+        weight, up = rng.random(300), np.array([0.1, 0.2, 0.97])
+        up /= np.linalg.norm(up)
+        center, axes, size = upright_box(points, weight, up)
+        given = {"points": points.ravel().tolist(), "weight": weight.tolist(), "up": up.tolist()}
+        body = "return m.uprightBox([...given.weight.keys()], given.points, given.weight, given.up);"
+        found = module(page, "things", body, given)
+        for name, expected in (("center", center), ("axes", axes), ("size", size)):
+            np.testing.assert_allclose(found[name], expected, atol=1e-6)
+
+
+def test_a_word_lists_its_things_and_one_can_be_chosen_hidden_and_linked(page):
+    page.evaluate("lang3dxl.ask('windows')")
+    summary = page.locator("#prompts summary")
+    summary.wait_for()
+    assert summary.inner_text().startswith("2")
+    summary.click()
+    chips = page.locator("#prompts ol button")
+    assert chips.count() == 2
+    assert page.locator("#boxes path.thing").count() == 2
+    page.evaluate("document.body.dispatchEvent(new KeyboardEvent('keydown', { key: ']', bubbles: true }))")
+    rest(page)
+    assert chips.nth(0).get_attribute("aria-pressed") == "true"
+    page.get_by_role("button", name="Hide the rest").click()
+    shown = page.evaluate("lang3dxl.view.only.size")
+    assert 0 < shown < page.evaluate("lang3dxl.view.root.count")
+    rest(page)
+    page.wait_for_timeout(400)
+    address = page.evaluate("location.hash")
+    assert "thing=" in address
+    assert "alone=1" in address
+    page.locator("body").press("Escape")
+    assert page.evaluate("lang3dxl.view.only") is None
+    page.evaluate("lang3dxl.clear()")
+    page.evaluate("(hash) => { location.hash = hash; }", address)
+    page.locator("#prompts ol button[aria-pressed=true]").wait_for()
+    assert page.evaluate("lang3dxl.view.only.size") == shown
+    page.evaluate("lang3dxl.clear()")
+
+
+def test_questions_typed_into_the_page_are_answered_or_refused(page):
+    told = page.evaluate("lang3dxl.ask('how many windows are there?').then(({ told }) => told)")
+    assert told.startswith("2") and "windows" in told
+    told = page.evaluate("lang3dxl.ask('leftmost window').then(({ told }) => told)")
+    assert told.startswith("window ")
+    assert page.locator("#prompts ol button[aria-pressed=true]").count() == 1
+    refused = "lang3dxl.ask('how many windows near the dome').catch((error) => error.message)"
+    assert "near" in page.evaluate(refused)
+    page.evaluate("lang3dxl.clear()")
+    assert page.evaluate("lang3dxl.view.only") is None
