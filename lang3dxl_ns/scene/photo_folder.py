@@ -31,6 +31,7 @@ from lang3dxl_ns.common.pictures import (
     unreadable,
 )
 from lang3dxl_ns.scene.masks import photos_of_mask
+from lang3dxl_ns.scene.reconstruction import PICTURE, REPORT
 
 IMAGE_FOLDERS = (Path("images"), Path("dense/images"))
 _NOT_PHOTOS = {
@@ -124,6 +125,7 @@ def photos_below(folder: Path) -> list[str]:
         folders[:] = [f for f in folders if f.lower() not in _NOT_PHOTOS and not f.startswith((".", "_"))]
         if Path(parent).name == "reconstruction":
             folders[:] = [f for f in folders if f != "numbered"]
+            files = [f for f in files if f != PICTURE.name or REPORT.name not in files]
         pictures = [
             file
             for file in files

@@ -14,6 +14,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, replace
+from io import BytesIO
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
@@ -27,6 +28,7 @@ from lang3dxl_ns.common.files import expanded, locked, read_json, replace_file
 from lang3dxl_ns.common.memory import machine_memory
 from lang3dxl_ns.common.pictures import open_picture
 from lang3dxl_ns.common.reports import measure, part
+from lang3dxl_ns.scene.camera_picture import camera_picture
 from lang3dxl_ns.scene.colmap import load_pycolmap
 from lang3dxl_ns.scene.companions import cache_folder
 from lang3dxl_ns.scene.learned_features import extract_learned, features_for, match_learned
@@ -46,7 +48,7 @@ from lang3dxl_ns.scene.placements import (
     matched_pairs,
     rotations_of,
 )
-from lang3dxl_ns.scene.reconstruction import REPORT, ReconstructionReport, ReconstructionSettings
+from lang3dxl_ns.scene.reconstruction import PICTURE, REPORT, ReconstructionReport, ReconstructionSettings
 from lang3dxl_ns.scene.symmetry import without_contradictions
 
 if TYPE_CHECKING:
@@ -109,7 +111,7 @@ def reconstruct(
         seconds={stage: round(sum(spent), 1) for stage, spent in clock.items()},
     )  # fmt: skip
     _publish(models, model)
-    replace_file(work / REPORT.name, json.dumps(asdict(report), indent=2))
+    _tell(report, best, work)
     return report
 
 
@@ -129,7 +131,7 @@ def reconstruct_scene(
         model = work / "sparse"
     with locked(work, busy=f"another command reconstructs in {work}: wait for it, or end it"):
         report = reconstruct(photos, work, model, settings)
-    say(*report.lines())
+    say(*report.lines(), f"cameras and points from above and from the side: {work / PICTURE.name}")
     return data, model / "0"
 
 
@@ -340,6 +342,17 @@ def _publish(models: list[pycolmap.Reconstruction], model: Path) -> None:
     except OSError as error:
         trouble = f"the model can't be written to {model} ({error})"
         raise UserError(f"{trouble}: make room, or choose --cache-dir") from error
+
+
+def _tell(report: ReconstructionReport, model: pycolmap.Reconstruction, work: Path) -> None:
+    """Write the report and the picture of cameras and points."""
+    posed = [image for image in model.images.values() if image.has_pose]
+    poses = np.stack([image.cam_from_world().inverse().matrix() for image in posed])
+    points = np.array([point.xyz for point in model.points3D.values()]).reshape(-1, 3)
+    png = BytesIO()
+    camera_picture(poses, [image.name for image in posed], report.doubtful, points).save(png, "PNG")
+    replace_file(work / PICTURE.name, png.getvalue())
+    replace_file(work / REPORT.name, json.dumps(asdict(report), indent=2))
 
 
 def _features_and_partners(database: Path) -> tuple[dict[str, int], Counter[str]]:

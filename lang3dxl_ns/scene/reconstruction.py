@@ -13,6 +13,8 @@ from lang3dxl_ns.common.files import read_json
 
 REPORT = Path("reconstruction/report.json")
 """File of the report in a scene's cache."""
+PICTURE = REPORT.with_name("cameras.png")
+"""File beside the report that shows cameras and points."""
 
 
 @dataclass
