@@ -123,7 +123,7 @@ def photos_below(folder: Path) -> list[str]:
     names = []
     for parent, folders, files in os.walk(folder):
         folders[:] = [f for f in folders if f.lower() not in _NOT_PHOTOS and not f.startswith((".", "_"))]
-        if Path(parent).name == "reconstruction":
+        if Path(parent).name in ("reconstruction", "adding"):
             folders[:] = [f for f in folders if f != "numbered"]
             files = [f for f in files if f != PICTURE.name or REPORT.name not in files]
         pictures = [

@@ -11,7 +11,7 @@ import json
 import os
 import shutil
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, replace
 from io import BytesIO
@@ -80,14 +80,15 @@ def reconstruct(
     if model.exists() and (model_in(model) or any(model.iterdir())):
         raise UserError(f"{model} already exists and is left alone; remove it to reconstruct the photos anew")
     say(f"{len(photos.names)} photos in {photos.folder}, without a COLMAP model: reconstructing")
-    good, left_out = _usable(photos)
-    with _quiet(), measure() as clock:
+    good, left_out = usable(photos)
+    _check_enough(photos, good, left_out)
+    with quiet(), measure() as clock:
         with part("features"):
-            copies = _numbered(good, work)
-            database = _database(good, copies, work, settings)
-            _extract(database, copies, settings)
+            copies = numbered(good, work)
+            database = feature_database(good, copies, work, settings)
+            extract(database, copies, settings)
         with part("matching"):
-            _match(database, copies.names, settings)
+            match(database, copies.names, settings)
         with part("mapping"):
             models, contradicting = _map(database, copies, work, settings.mapper), 0
             if models and len(_doubts(database, models[0])) > _DOUBTED * models[0].num_reg_images():
@@ -120,7 +121,7 @@ def reconstruct_scene(
 ) -> tuple[Path, Path]:
     """Reconstruct a folder of photos or a video, and return the scene's folder and model: sparse/0 in it or,
     if sparse is taken or the folder is read-only, in the cache. Raises UserError as `reconstruct` does."""
-    check_numbers(settings or ReconstructionSettings(), {"max_size": (100, 1e5), "max_features": (100, 1e6)})
+    check_settings(settings or ReconstructionSettings())
     data = expanded(data).absolute()
     if is_video(data):
         data = extract_frames(data)
@@ -133,6 +134,11 @@ def reconstruct_scene(
         report = reconstruct(photos, work, model, settings)
     say(*report.lines(), f"cameras and points from above and from the side: {work / PICTURE.name}")
     return data, model / "0"
+
+
+def check_settings(settings: ReconstructionSettings) -> None:
+    """Raise UserError for sizes that crash COLMAP."""
+    check_numbers(settings, {"max_size": (100, 1e5), "max_features": (100, 1e6)})
 
 
 def model_in(folder: Path) -> bool:
@@ -152,9 +158,8 @@ def shows_these(work: Path, data: Path) -> bool:
     return 2 * len(recorded & here) > len(recorded)
 
 
-def _usable(photos: PhotoFolder) -> tuple[PhotoFolder, dict[str, str]]:
-    """Separate the readable photos, without duplicate files, from the others, for which reasons are given.
-    Raises UserError if fewer than two photos are usable."""
+def usable(photos: PhotoFolder) -> tuple[PhotoFolder, dict[str, str]]:
+    """Separate the readable photos, without duplicate files, from the others, for which reasons are given."""
     good, left_out = readable(photos)
     first: dict[bytes, str] = {}
     for name in good.names:
@@ -164,8 +169,13 @@ def _usable(photos: PhotoFolder) -> tuple[PhotoFolder, dict[str, str]]:
         content = hashlib.blake2b((photos.folder / name).read_bytes()).digest()
         if first.setdefault(content, name) != name:
             left_out[name] = f"the same file as {first[content]}"
-    if len(first) >= 2:
-        return PhotoFolder(photos.folder, tuple(first.values())), left_out
+    return PhotoFolder(photos.folder, tuple(first.values())), left_out
+
+
+def _check_enough(photos: PhotoFolder, good: PhotoFolder, left_out: Mapping[str, str]) -> None:
+    """Raise UserError if fewer than two photos are usable."""
+    if len(good.names) >= 2:
+        return
     if not photos.names:
         raise UserError(
             f"{photos.folder} holds neither photos nor a COLMAP model: give the folder with your photos "
@@ -177,12 +187,12 @@ def _usable(photos: PhotoFolder) -> tuple[PhotoFolder, dict[str, str]]:
         )
     name, why = next(iter(left_out.items()))
     raise UserError(
-        f"of the {len(photos.names)} photos in {photos.folder} {len(first)} are usable, but a scene "
+        f"of the {len(photos.names)} photos in {photos.folder} {len(good.names)} are usable, but a scene "
         f"needs at least three different ones: {name}: {why}"
     )
 
 
-def _numbered(photos: PhotoFolder, work: Path) -> PhotoFolder:
+def numbered(photos: PhotoFolder, work: Path) -> PhotoFolder:
     """Link the photos under numbers, in their order; formats that COLMAP can't read become converted copies.
     COLMAP separates names by spaces, so "photo 1.jpg" would be two names."""
     folder = work / "numbered"  # not "photos", a name that people use
@@ -206,7 +216,9 @@ def _numbered(photos: PhotoFolder, work: Path) -> PhotoFolder:
     return PhotoFolder(folder, tuple(numbers))
 
 
-def _database(photos: PhotoFolder, copies: PhotoFolder, work: Path, settings: ReconstructionSettings) -> Path:
+def feature_database(
+    photos: PhotoFolder, copies: PhotoFolder, work: Path, settings: ReconstructionSettings
+) -> Path:
     """Make the database of photos and cameras, or reuse one with the same photos and settings."""
     pycolmap = load_pycolmap()
     states = [(photos.folder / name).stat() for name in photos.names]
@@ -241,7 +253,7 @@ def _database(photos: PhotoFolder, copies: PhotoFolder, work: Path, settings: Re
     return database
 
 
-def _extract(database: Path, photos: PhotoFolder, settings: ReconstructionSettings) -> None:
+def extract(database: Path, photos: PhotoFolder, settings: ReconstructionSettings) -> None:
     """Extract the features that are missing in the database."""
     if settings.features == "xfeat":
         size, count = settings.max_size, settings.max_features
@@ -262,17 +274,22 @@ def _extract(database: Path, photos: PhotoFolder, settings: ReconstructionSettin
             advance(len(chunk))
 
 
-def _match(database: Path, names: Sequence[str], settings: ReconstructionSettings) -> None:
-    """Find and verify the matches of pairs that are missing in the database."""
+def match(
+    database: Path, names: Sequence[str], settings: ReconstructionSettings, new: Collection[str] | None = None
+) -> None:
+    """Find and verify the matches of pairs that are missing in the database, only those with one of `new`
+    where that is given."""
+    new = set(names if new is None else new)
     if settings.features == "xfeat":
-        return match_learned(database, names, database.with_name("xfeat"))
+        return match_learned(database, names, database.with_name("xfeat"), new)
     pycolmap = load_pycolmap()
     with pycolmap.Database.open(database) as db:
         ids = {image.name: image.image_id for image in db.read_all_images()}
         known = [n for n in names if n in ids and db.num_keypoints_for_image(ids[n])]
         pairs = pairs_to_match(known, lambda name: db.read_descriptors(ids[name]).data)
         has = db.exists_matches, db.exists_two_view_geometry
-        missing = [(a, b) for a, b in pairs if not all(there(ids[a], ids[b]) for there in has)]
+        wanted = [pair for pair in pairs if not new.isdisjoint(pair)]
+        missing = [(a, b) for a, b in wanted if not all(there(ids[a], ids[b]) for there in has)]
     options = pycolmap.FeatureMatchingOptions(num_threads=_threads(5e8))
     listed = database.with_name("pairs.txt")
     pairing = pycolmap.ImportedPairingOptions(match_list_path=listed)
@@ -412,7 +429,7 @@ def _threads(memory_each: float) -> int:
 
 
 @contextmanager
-def _quiet() -> Iterator[None]:
+def quiet() -> Iterator[None]:
     """Suppress COLMAP's log of thousands of lines; the report contains what matters."""
     logging = load_pycolmap().logging
     level, logging.minloglevel = logging.minloglevel, int(logging.FATAL)

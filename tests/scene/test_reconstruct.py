@@ -195,7 +195,7 @@ def test_photos_in_a_folder_of_that_name_beside_the_work_stay(photos, tmp_path):
     """As with `reconstruct --data castle/reconstruction/photos --cache-dir castle`."""
     own = tmp_path / "reconstruction" / "photos"
     shutil.copytree(photos / "images", own)
-    module._numbered(find_photos(own), own.parent)
+    module.numbered(find_photos(own), own.parent)
     assert find_photos(own).names == find_photos(photos).names
 
 
