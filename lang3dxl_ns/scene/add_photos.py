@@ -9,11 +9,12 @@ from __future__ import annotations
 import filecmp
 import os
 import shutil
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float, Int64
@@ -48,6 +49,10 @@ _LEAST_POINTS = 30
 _NEAR = 0.0015
 """Distance from a keypoint of the model to a feature of the same place, relative to the longer side."""
 _FOCAL = 0.1, 10.0  # plausible focal lengths, relative to the longer side
+_ERROR = 0.005
+"""Largest distance of a point from its pixel that agrees with a pose, relative to the longer side."""
+_TRUST = 1.1
+"""How many times as many points must agree with a camera of its own as with one of the model's."""
 _PARTS = ("cameras", "images", "points3D", "rigs", "frames")
 
 
@@ -162,6 +167,14 @@ class _Scene:
         for group in shared_cameras(photos):
             known = next((own[name] for name in group if name in own), None)
             self._shared |= dict.fromkeys(group, known)
+        uses = Counter(image.camera_id for image in images.values())
+        sizes = Counter((camera.width, camera.height) for camera in own.values())
+        self._usual = {
+            (camera.width, camera.height): camera
+            for camera in model.cameras.values()
+            if uses[camera.camera_id] > max(2, sizes[camera.width, camera.height] / 2)
+        }
+        """Cameras that took most photos of their size."""
         for number, name in names.items():
             if name in images:
                 self._points[number] = self._shown(number, images[name], own[name])
@@ -219,33 +232,53 @@ class _Scene:
             shown = shown[np.sort(np.unique(shown[:, column], return_index=True)[1])]
         if len(shown) < _LEAST_POINTS:
             return None
-        stored, keypoints = self._stored(photo), self._database.read_keypoints(photo)
-        known = self._shared[self.names[photo]]
-        fixed = known is not None and (known.width, known.height) == (stored.width, stored.height)
-        camera = type(stored)((known if fixed and known else stored).todict())
-        found = load_pycolmap().estimate_and_refine_absolute_pose(
-            keypoints[shown[:, 0], :2].astype(float),
-            np.stack([self._positions[point] for point in shown[:, 1].tolist()]),
-            camera,
-            {
-                "estimate_focal_length": not fixed and not stored.has_prior_focal_length,
-                "ransac": {"random_seed": 0},
-            },
-            {"refine_focal_length": not fixed, "refine_extra_params": not fixed},
-        )
-        focal = camera.mean_focal_length() / max(camera.width, camera.height)
-        if found is None or found["num_inliers"] < _LEAST_POINTS or not _FOCAL[0] < focal < _FOCAL[1]:
+        keypoints = self._database.read_keypoints(photo)
+        pixels = keypoints[shown[:, 0], :2].astype(float)
+        positions = np.stack([self._positions[point] for point in shown[:, 1].tolist()])
+        best, most = None, float(_LEAST_POINTS)
+        for camera, fixed in self._cameras_for(photo):
+            found = _solve(camera, fixed, pixels, positions)
+            if found and found["num_inliers"] >= most:
+                best, most = (camera, found), found["num_inliers"] * _TRUST
+        if best is None:
             return None
-        agreeing = shown[np.asarray(found["inlier_mask"], bool)]
+        agreeing = shown[np.asarray(best[1]["inlier_mask"], bool)]
         points = np.full(len(keypoints), -1)
         points[agreeing[:, 0]] = agreeing[:, 1]
-        return _Placed(camera, found["cam_from_world"], points)
+        return _Placed(best[0], best[1]["cam_from_world"], points)
+
+    def _cameras_for(self, photo: int) -> list[tuple[pycolmap.Camera, bool]]:
+        """Return the cameras that may have taken a photo, and whether each is fixed: one of the model's by
+        EXIF, or by size where EXIF is silent, and the photo's own."""
+        own = self._stored(photo)
+        size = own.width, own.height
+        known = self._shared[self.names[photo]]
+        if known is None and not own.has_prior_focal_length:
+            known = self._usual.get(size)
+        fits = known is not None and (known.width, known.height) == size
+        return [*([(type(own)(known.todict()), True)] if known and fits else []), (own, False)]
 
     def doubts(self, placed: dict[int, _Placed]) -> dict[str, str]:
         """Find new photos whose matches contradict their place, with reasons."""
         pairs = matched_pairs(self._database, self._cameras)
         reasons = doubtful_placements(self._rotations, pairs)
         return {self.names[number]: why for number, why in reasons.items() if number in placed}
+
+
+def _solve(
+    camera: pycolmap.Camera, fixed: bool, pixels: Float[Array, "n 2"], points: Float[Array, "n 3"]
+) -> dict[str, Any] | None:
+    """Find a photo's pose by the points that its pixels show, with COLMAP's answer, and its lens unless that
+    is `fixed`."""
+    estimation = {
+        "estimate_focal_length": not fixed and not camera.has_prior_focal_length,
+        "ransac": {"random_seed": 0, "max_error": _ERROR * max(camera.width, camera.height)},
+    }
+    refinement = {"refine_focal_length": not fixed, "refine_extra_params": not fixed}
+    estimate = load_pycolmap().estimate_and_refine_absolute_pose
+    found: dict[str, Any] | None = estimate(pixels, points, camera, estimation, refinement)
+    focal = camera.mean_focal_length() / max(camera.width, camera.height)
+    return found if _FOCAL[0] < focal < _FOCAL[1] else None
 
 
 def _add(model: pycolmap.Reconstruction, photo: _Placed, name: str, keypoints: Float[Array, "n 2"]) -> None:

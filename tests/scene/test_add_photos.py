@@ -81,6 +81,28 @@ def test_new_photos_find_their_places_and_nothing_else_moves(scene, capsys):
     assert "2 of 2 new photos have a pose" in capsys.readouterr().out
 
 
+def late_cameras(model):
+    model = pycolmap.Reconstruction(model)
+    late = [image for image in model.images.values() if image.name.startswith("late/")]
+    return [model.cameras[image.camera_id].params for image in late], model.cameras[1].params
+
+
+def test_a_photo_of_the_size_that_one_camera_of_the_model_takes_has_its_lens(scene):
+    params, old = late_cameras(add_photos(scene / "data", scene / "late", None, SIFT))
+    assert all((found == old).all() for found in params)
+
+
+def test_a_photo_of_another_size_finds_its_own_lens(scene):
+    for name in LATE:
+        with Image.open(scene / "late" / name) as image:
+            image.resize((320, 240), Image.Resampling.LANCZOS).save(scene / "late" / name, quality=97)
+    model = add_photos(scene / "data", scene / "late", None, SIFT)
+    params, old = late_cameras(model)
+    assert all(abs(found[0] / old[0] - 320 / 240) < 0.15 for found in params)
+    distances = errors(model, scene / "true/sparse/0")
+    assert max(distances[f"late/{name}"] for name in LATE) < 0.3  # of about 4 to the box
+
+
 def test_the_model_as_it_was_is_kept(scene):
     files = {path.name: path.read_bytes() for path in (scene / "data/sparse/0").iterdir()}
     add_photos(scene / "data", scene / "late", None, SIFT)
