@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from lang3dxl_ns.training.batches import TrainingData
 
 
-@showing("data", "add", "features", "max_features", "one_camera")
+@showing("data", "add", "features")
 @dataclass(kw_only=True)
 class Reconstruct(ReconstructionSettings):
     """Reconstruct photos: cameras, poses and points, as a COLMAP model.

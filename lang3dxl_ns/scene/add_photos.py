@@ -7,10 +7,12 @@ the matches show. A photo's pose follows from its points alone, so nothing of th
 from __future__ import annotations
 
 import filecmp
+import json
 import os
 import shutil
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -22,8 +24,8 @@ from numpy import ndarray as Array
 from scipy.spatial import KDTree
 
 from lang3dxl_ns.common.console import say
-from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.common.files import expanded, locked, make_folder
+from lang3dxl_ns.common.errors import DAMAGE, UserError
+from lang3dxl_ns.common.files import expanded, locked, make_folder, read_json, replace_file
 from lang3dxl_ns.scene.colmap import load_pycolmap, read_reconstruction
 from lang3dxl_ns.scene.companions import cache_folder, inside
 from lang3dxl_ns.scene.layout import find_model, has_model, images_folder
@@ -38,8 +40,15 @@ from lang3dxl_ns.scene.reconstruct import (
     numbered,
     quiet,
     usable,
+    write_picture,
 )
-from lang3dxl_ns.scene.reconstruction import REPORT, ReconstructionSettings, reasons_in_words
+from lang3dxl_ns.scene.reconstruction import (
+    REPORT,
+    ReconstructionSettings,
+    doubtful_photos,
+    picture_line,
+    reasons_in_words,
+)
 
 if TYPE_CHECKING:
     import pycolmap
@@ -115,14 +124,16 @@ def add_photos(
             for name, (i, photo) in found.items():
                 _add(model, photo, targets[name], db.read_keypoints(i)[:, :2].astype(float))
     lost = {targets[n]: left_out.get(n, "too few of its matches agree") for n in targets if n not in found}
-    told = reasons_in_words(
-        {"without a place": lost, "doubtfully placed": {targets[n]: w for n, w in doubtful.items()}}
-    )
+    doubtful = {targets[name]: why for name, why in doubtful.items()}
+    told = reasons_in_words({"without a place": lost, "doubtfully placed": doubtful})
     if not found:
         raise UserError(f"none of the {len(targets)} new photos finds a place; {'; '.join(told)}")
     _copy(images, {name: targets[name] for name in found})
     kept = _replace(place, model, work.parent)
+    write_picture(model, doubtful | doubtful_photos(work.parent.parent), work.parent)
+    _report(work.parent / REPORT.name, len(targets), len(found), doubtful)
     say(f"{len(found)} of {len(targets)} new photos have a pose; the model as it was is in {kept}", *told)
+    say(picture_line(work.parent))
     return place
 
 
@@ -299,6 +310,16 @@ def _copy(images: Path, targets: dict[str, str]) -> None:
         if not (images / target).exists():
             make_folder((images / target).parent)
             shutil.copy2(images / name, images / target)
+
+
+def _report(path: Path, photos: int, placed: int, doubtful: dict[str, str]) -> None:
+    """Update the model's report, if it has one: doubtful photos are asked for there."""
+    with suppress(*DAMAGE):
+        told = read_json(path)
+        told["photos"] += photos
+        told["registered"] += placed
+        told["doubtful"] |= doubtful
+        replace_file(path, json.dumps(told, indent=2))
 
 
 def _replace(place: Path, model: pycolmap.Reconstruction, work: Path) -> Path:

@@ -48,7 +48,13 @@ from lang3dxl_ns.scene.placements import (
     matched_pairs,
     rotations_of,
 )
-from lang3dxl_ns.scene.reconstruction import PICTURE, REPORT, ReconstructionReport, ReconstructionSettings
+from lang3dxl_ns.scene.reconstruction import (
+    PICTURE,
+    REPORT,
+    ReconstructionReport,
+    ReconstructionSettings,
+    picture_line,
+)
 from lang3dxl_ns.scene.symmetry import without_contradictions
 
 if TYPE_CHECKING:
@@ -112,7 +118,8 @@ def reconstruct(
         seconds={stage: round(sum(spent), 1) for stage, spent in clock.items()},
     )  # fmt: skip
     _publish(models, model)
-    _tell(report, best, work)
+    write_picture(best, doubtful, work)
+    replace_file(work / REPORT.name, json.dumps(asdict(report), indent=2))
     return report
 
 
@@ -132,7 +139,7 @@ def reconstruct_scene(
         model = work / "sparse"
     with locked(work, busy=f"another command reconstructs in {work}: wait for it, or end it"):
         report = reconstruct(photos, work, model, settings)
-    say(*report.lines(), f"cameras and points from above and from the side: {work / PICTURE.name}")
+    say(*report.lines(), picture_line(work))
     return data, model / "0"
 
 
@@ -361,15 +368,14 @@ def _publish(models: list[pycolmap.Reconstruction], model: Path) -> None:
         raise UserError(f"{trouble}: make room, or choose --cache-dir") from error
 
 
-def _tell(report: ReconstructionReport, model: pycolmap.Reconstruction, work: Path) -> None:
-    """Write the report and the picture of cameras and points."""
+def write_picture(model: pycolmap.Reconstruction, doubtful: Collection[str], work: Path) -> None:
+    """Write the picture of a model's cameras and points into the folder of its report."""
     posed = [image for image in model.images.values() if image.has_pose]
     poses = np.stack([image.cam_from_world().inverse().matrix() for image in posed])
     points = np.array([point.xyz for point in model.points3D.values()]).reshape(-1, 3)
     png = BytesIO()
-    camera_picture(poses, [image.name for image in posed], report.doubtful, points).save(png, "PNG")
+    camera_picture(poses, [image.name for image in posed], doubtful, points).save(png, "PNG")
     replace_file(work / PICTURE.name, png.getvalue())
-    replace_file(work / REPORT.name, json.dumps(asdict(report), indent=2))
 
 
 def _features_and_partners(database: Path) -> tuple[dict[str, int], Counter[str]]:

@@ -97,6 +97,11 @@ def reasons_in_words(told: Mapping[str, Mapping[str, str]]) -> list[str]:
     return lines
 
 
+def picture_line(work: Path) -> str:
+    """Name the picture of a reconstruction in its folder."""
+    return f"cameras and points from above and from the side: {work / PICTURE.name}"
+
+
 def doubtful_photos(cache_dir: Path) -> dict[str, str]:
     """Read from a scene's cache which photos were doubtfully placed, with reasons; none without a report."""
     with suppress(*DAMAGE):

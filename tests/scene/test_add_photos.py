@@ -1,5 +1,6 @@
 """New photos for a model: they find their places, and nothing of the model moves or is lost."""
 
+import json
 import shutil
 
 import numpy as np  # before pycolmap
@@ -15,7 +16,7 @@ from lang3dxl_ns.scene.add_photos import add_photos
 from lang3dxl_ns.scene.colmap import read_reconstruction
 from lang3dxl_ns.scene.photo_folder import find_photos
 from lang3dxl_ns.scene.reconstruct import reconstruct_scene
-from lang3dxl_ns.scene.reconstruction import ReconstructionSettings
+from lang3dxl_ns.scene.reconstruction import ReconstructionSettings, doubtful_photos
 
 SIFT = ReconstructionSettings(features="sift")
 LATE = ("photo_002.jpg", "photo_005.jpg")
@@ -101,6 +102,16 @@ def test_a_photo_of_another_size_finds_its_own_lens(scene):
     assert all(abs(found[0] / old[0] - 320 / 240) < 0.15 for found in params)
     distances = errors(model, scene / "true/sparse/0")
     assert max(distances[f"late/{name}"] for name in LATE) < 0.3  # of about 4 to the box
+
+
+def test_the_report_and_the_picture_know_the_new_photos(scene, monkeypatch):
+    work = scene / "data/lang3dxl_cache/reconstruction"
+    before = (work / "cameras.png").read_bytes()
+    monkeypatch.setattr(module, "doubtful_placements", lambda *_: dict.fromkeys(range(1, 8), "it looks away"))
+    add_photos(scene / "data", scene / "late", None, SIFT)
+    assert doubtful_photos(work.parent) == {f"late/{name}": "it looks away" for name in LATE}
+    assert json.loads((work / "report.json").read_text())["registered"] == 7
+    assert (work / "cameras.png").read_bytes() != before
 
 
 def test_the_model_as_it_was_is_kept(scene):
