@@ -18,23 +18,31 @@ if TYPE_CHECKING:
     from lang3dxl_ns.training.batches import TrainingData
 
 
-@showing("data", "features", "max_features", "one_camera")
+@showing("data", "add", "features")
 @dataclass(kw_only=True)
 class Reconstruct(ReconstructionSettings):
     """Reconstruct photos: cameras, poses and points, as a COLMAP model.
 
     `ns-train lang3dxl` does this itself for photos without a model; this command does it in advance. It can
-    be interrupted and repeated at any time, and never replaces an existing model.
+    be interrupted and repeated at any time, and never replaces an existing model, except by one with photos
+    added, of which the old form is kept.
     """
 
     data: Path
     """Folder of photos (in it, in images/, or in sub-folders), or a video."""
     cache_dir: Path | None = None
     """Folder for features and matches (default: lang3dxl_cache inside the data folder)."""
+    add: Path | None = None
+    """Folder of new photos for the model that the data folder has, whose cameras and points stay."""
 
     def main(self) -> None:
         from lang3dxl_ns.scene.reconstruct import reconstruct_scene
 
+        if self.add is not None:
+            from lang3dxl_ns.scene.add_photos import add_photos
+
+            model = add_photos(self.data, self.add, self.cache_dir, self)
+            return say(f"The model is in {model}")
         data, model = reconstruct_scene(self.data, self.cache_dir, self)
         say(f"The model is in {model}. Train with: ns-train lang3dxl --data {shlex.quote(str(data))}")
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import io
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from importlib.util import find_spec
@@ -139,13 +139,15 @@ def extract_learned(database: Path, photos: PhotoFolder, kept: Path, max_size: i
                 advance(1)
 
 
-def match_learned(database: Path, names: Sequence[str], kept: Path) -> None:
-    """Match and verify the pairs of photos that may overlap and are missing in the database."""
+def match_learned(database: Path, names: Sequence[str], kept: Path, new: Collection[str]) -> None:
+    """Match and verify the pairs of photos that may overlap, with one of `new`, and are missing in the
+    database."""
     pycolmap = load_pycolmap()
     with pycolmap.Database.open(database) as db:
         ids = {image.name: image.image_id for image in db.read_all_images()}
         known = {n: Features.load(_kept(kept, n)) for n in names if n in ids and db.exists_keypoints(ids[n])}
-        pairs = [(a, b) for a, b in alike_pairs(known) if not db.exists_matches(ids[a], ids[b])]
+        wanted = [(a, b) for a, b in alike_pairs(known) if a in new or b in new]
+        pairs = [(a, b) for a, b in wanted if not db.exists_matches(ids[a], ids[b])]
         networks = Networks()
         with progress("pairs of photos", len(pairs)) as advance:
             for a, b in pairs:

@@ -31,6 +31,7 @@ from lang3dxl_ns.common.pictures import (
     unreadable,
 )
 from lang3dxl_ns.scene.masks import photos_of_mask
+from lang3dxl_ns.scene.reconstruction import PICTURE, REPORT
 
 IMAGE_FOLDERS = (Path("images"), Path("dense/images"))
 _NOT_PHOTOS = {
@@ -122,8 +123,9 @@ def photos_below(folder: Path) -> list[str]:
     names = []
     for parent, folders, files in os.walk(folder):
         folders[:] = [f for f in folders if f.lower() not in _NOT_PHOTOS and not f.startswith((".", "_"))]
-        if Path(parent).name == "reconstruction":
+        if Path(parent).name in ("reconstruction", "adding"):
             folders[:] = [f for f in folders if f != "numbered"]
+            files = [f for f in files if f != PICTURE.name or REPORT.name not in files]
         pictures = [
             file
             for file in files
@@ -166,6 +168,9 @@ FRAMES_PER_SECOND = 2.0
 MOST_FRAMES = 300
 """Maximum number of frames; the rate is reduced for a long video."""
 _LOOK = (240, 135)  # pixels at which sharpness is judged; motion blur is visible there too
+_COARSE = 15  # pixels of these that are averaged along each side to see change
+_MOST_CHANGE = 95
+"""Percentile of the changes between frames that larger ones are reduced to."""
 
 _READING = ("-v", "error", "-protocol_whitelist", "file", "-format_whitelist", "mov,matroska,avi,mpegts,mpeg")
 """Options of ffmpeg for untrusted files: a playlist, for example, could name other files and addresses."""
@@ -216,32 +221,41 @@ def extract_frames(video: Path, rate: float = FRAMES_PER_SECOND, most: int = MOS
     duration = _duration(video)
     stretches = max(1, min(most, int(duration * rate + 0.01)))  # times are rounded
     say(f"{video.name}: {duration:.0f} s, the sharpest frame of each of {stretches} intervals")
-    sharpness = _sharpness(video)
+    sharpness, change = _looks(video)
     if len(sharpness) < 3:
         raise UserError(f"{video} has {len(sharpness)} frames: a scene needs a walk of some seconds")
-    _write(video, folder, _sharpest(sharpness, min(stretches, len(sharpness))))
+    _write(video, folder, _sharpest(sharpness, change, min(stretches, len(sharpness))))
     replace_file(made_of, json.dumps(this))
     return folder
 
 
-def _sharpest(sharpness: Float[Array, " n"], stretches: int) -> Int[Array, " s"]:
-    """Return the index of the largest value in each of `stretches` equal parts."""
-    parts = np.array_split(np.arange(len(sharpness)), stretches)
+def _sharpest(sharpness: Float[Array, " n"], change: Float[Array, " n"], stretches: int) -> Int[Array, " s"]:
+    """Return the index of the sharpest frame of each of `stretches` parts of a video. A part is long in time
+    or in change: where somebody stands still, frames tell nothing new, and a turn needs many to overlap."""
+    steps = change.clip(max=np.percentile(change, _MOST_CHANGE))  # a cut or a flash is no way
+    gone = np.cumsum(steps) / max(steps.sum(), 1e-9) if steps.any() else np.arange(len(steps)) / len(steps)
+    progress = (np.arange(len(steps)) / len(steps) + gone) / 2
+    ends = np.searchsorted(progress, np.arange(1, stretches) / stretches - 1e-9)
+    parts = [part for part in np.split(np.arange(len(steps)), ends) if len(part)]
     return np.array([part[sharpness[part].argmax()] for part in parts])
 
 
-def _sharpness(video: Path) -> Float[Array, " n"]:
-    """Compute the variance of the Laplacian of every frame, downsized and gray."""
+def _looks(video: Path) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+    """Compute, for every frame, downsized and gray, the variance of its Laplacian and its difference from the
+    frame before, which is coarse so that noise is none."""
     width, height = _LOOK
     command = [*_reading("ffmpeg", video), "-an", "-vf", f"scale={width}:{height}"]
     command += ["-fps_mode", "passthrough", "-f", "rawvideo", "-pix_fmt", "gray", "-"]
-    values = []
+    values, changes, before = [], [], None
     with subprocess.Popen(command, stdin=_SILENT, stdout=subprocess.PIPE, stderr=_SILENT) as process:
         assert process.stdout is not None
         while len(frame := process.stdout.read(width * height)) == width * height:
             gray = np.frombuffer(frame, np.uint8).reshape(height, width).astype(np.float32)
             values.append(ndimage.laplace(gray).var())
-    return np.array(values)
+            coarse = gray.reshape(height // _COARSE, _COARSE, width // _COARSE, _COARSE).mean((1, 3))
+            changes.append(0.0 if before is None else float(np.abs(coarse - before).mean()))
+            before = coarse
+    return np.array(values), np.array(changes)
 
 
 def _duration(video: Path) -> float:

@@ -11,9 +11,10 @@ import json
 import os
 import shutil
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, replace
+from io import BytesIO
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
@@ -27,6 +28,7 @@ from lang3dxl_ns.common.files import expanded, locked, read_json, replace_file
 from lang3dxl_ns.common.memory import machine_memory
 from lang3dxl_ns.common.pictures import open_picture
 from lang3dxl_ns.common.reports import measure, part
+from lang3dxl_ns.scene.camera_picture import camera_picture
 from lang3dxl_ns.scene.colmap import load_pycolmap
 from lang3dxl_ns.scene.companions import cache_folder
 from lang3dxl_ns.scene.learned_features import extract_learned, features_for, match_learned
@@ -46,7 +48,13 @@ from lang3dxl_ns.scene.placements import (
     matched_pairs,
     rotations_of,
 )
-from lang3dxl_ns.scene.reconstruction import REPORT, ReconstructionReport, ReconstructionSettings
+from lang3dxl_ns.scene.reconstruction import (
+    PICTURE,
+    REPORT,
+    ReconstructionReport,
+    ReconstructionSettings,
+    picture_line,
+)
 from lang3dxl_ns.scene.symmetry import without_contradictions
 
 if TYPE_CHECKING:
@@ -78,14 +86,15 @@ def reconstruct(
     if model.exists() and (model_in(model) or any(model.iterdir())):
         raise UserError(f"{model} already exists and is left alone; remove it to reconstruct the photos anew")
     say(f"{len(photos.names)} photos in {photos.folder}, without a COLMAP model: reconstructing")
-    good, left_out = _usable(photos)
-    with _quiet(), measure() as clock:
+    good, left_out = usable(photos)
+    _check_enough(photos, good, left_out)
+    with quiet(), measure() as clock:
         with part("features"):
-            copies = _numbered(good, work)
-            database = _database(good, copies, work, settings)
-            _extract(database, copies, settings)
+            copies = numbered(good, work)
+            database = feature_database(good, copies, work, settings)
+            extract(database, copies, settings)
         with part("matching"):
-            _match(database, copies.names, settings)
+            match(database, copies.names, settings)
         with part("mapping"):
             models, contradicting = _map(database, copies, work, settings.mapper), 0
             if models and len(_doubts(database, models[0])) > _DOUBTED * models[0].num_reg_images():
@@ -109,6 +118,7 @@ def reconstruct(
         seconds={stage: round(sum(spent), 1) for stage, spent in clock.items()},
     )  # fmt: skip
     _publish(models, model)
+    write_picture(best, doubtful, work)
     replace_file(work / REPORT.name, json.dumps(asdict(report), indent=2))
     return report
 
@@ -118,7 +128,7 @@ def reconstruct_scene(
 ) -> tuple[Path, Path]:
     """Reconstruct a folder of photos or a video, and return the scene's folder and model: sparse/0 in it or,
     if sparse is taken or the folder is read-only, in the cache. Raises UserError as `reconstruct` does."""
-    check_numbers(settings or ReconstructionSettings(), {"max_size": (100, 1e5), "max_features": (100, 1e6)})
+    check_settings(settings or ReconstructionSettings())
     data = expanded(data).absolute()
     if is_video(data):
         data = extract_frames(data)
@@ -129,8 +139,13 @@ def reconstruct_scene(
         model = work / "sparse"
     with locked(work, busy=f"another command reconstructs in {work}: wait for it, or end it"):
         report = reconstruct(photos, work, model, settings)
-    say(*report.lines())
+    say(*report.lines(), picture_line(work))
     return data, model / "0"
+
+
+def check_settings(settings: ReconstructionSettings) -> None:
+    """Raise UserError for sizes that crash COLMAP."""
+    check_numbers(settings, {"max_size": (100, 1e5), "max_features": (100, 1e6)})
 
 
 def model_in(folder: Path) -> bool:
@@ -150,9 +165,8 @@ def shows_these(work: Path, data: Path) -> bool:
     return 2 * len(recorded & here) > len(recorded)
 
 
-def _usable(photos: PhotoFolder) -> tuple[PhotoFolder, dict[str, str]]:
-    """Separate the readable photos, without duplicate files, from the others, for which reasons are given.
-    Raises UserError if fewer than two photos are usable."""
+def usable(photos: PhotoFolder) -> tuple[PhotoFolder, dict[str, str]]:
+    """Separate the readable photos, without duplicate files, from the others, for which reasons are given."""
     good, left_out = readable(photos)
     first: dict[bytes, str] = {}
     for name in good.names:
@@ -162,8 +176,13 @@ def _usable(photos: PhotoFolder) -> tuple[PhotoFolder, dict[str, str]]:
         content = hashlib.blake2b((photos.folder / name).read_bytes()).digest()
         if first.setdefault(content, name) != name:
             left_out[name] = f"the same file as {first[content]}"
-    if len(first) >= 2:
-        return PhotoFolder(photos.folder, tuple(first.values())), left_out
+    return PhotoFolder(photos.folder, tuple(first.values())), left_out
+
+
+def _check_enough(photos: PhotoFolder, good: PhotoFolder, left_out: Mapping[str, str]) -> None:
+    """Raise UserError if fewer than two photos are usable."""
+    if len(good.names) >= 2:
+        return
     if not photos.names:
         raise UserError(
             f"{photos.folder} holds neither photos nor a COLMAP model: give the folder with your photos "
@@ -175,12 +194,12 @@ def _usable(photos: PhotoFolder) -> tuple[PhotoFolder, dict[str, str]]:
         )
     name, why = next(iter(left_out.items()))
     raise UserError(
-        f"of the {len(photos.names)} photos in {photos.folder} {len(first)} are usable, but a scene "
+        f"of the {len(photos.names)} photos in {photos.folder} {len(good.names)} are usable, but a scene "
         f"needs at least three different ones: {name}: {why}"
     )
 
 
-def _numbered(photos: PhotoFolder, work: Path) -> PhotoFolder:
+def numbered(photos: PhotoFolder, work: Path) -> PhotoFolder:
     """Link the photos under numbers, in their order; formats that COLMAP can't read become converted copies.
     COLMAP separates names by spaces, so "photo 1.jpg" would be two names."""
     folder = work / "numbered"  # not "photos", a name that people use
@@ -204,7 +223,9 @@ def _numbered(photos: PhotoFolder, work: Path) -> PhotoFolder:
     return PhotoFolder(folder, tuple(numbers))
 
 
-def _database(photos: PhotoFolder, copies: PhotoFolder, work: Path, settings: ReconstructionSettings) -> Path:
+def feature_database(
+    photos: PhotoFolder, copies: PhotoFolder, work: Path, settings: ReconstructionSettings
+) -> Path:
     """Make the database of photos and cameras, or reuse one with the same photos and settings."""
     pycolmap = load_pycolmap()
     states = [(photos.folder / name).stat() for name in photos.names]
@@ -239,7 +260,7 @@ def _database(photos: PhotoFolder, copies: PhotoFolder, work: Path, settings: Re
     return database
 
 
-def _extract(database: Path, photos: PhotoFolder, settings: ReconstructionSettings) -> None:
+def extract(database: Path, photos: PhotoFolder, settings: ReconstructionSettings) -> None:
     """Extract the features that are missing in the database."""
     if settings.features == "xfeat":
         size, count = settings.max_size, settings.max_features
@@ -260,17 +281,22 @@ def _extract(database: Path, photos: PhotoFolder, settings: ReconstructionSettin
             advance(len(chunk))
 
 
-def _match(database: Path, names: Sequence[str], settings: ReconstructionSettings) -> None:
-    """Find and verify the matches of pairs that are missing in the database."""
+def match(
+    database: Path, names: Sequence[str], settings: ReconstructionSettings, new: Collection[str] | None = None
+) -> None:
+    """Find and verify the matches of pairs that are missing in the database, only those with one of `new`
+    where that is given."""
+    new = set(names if new is None else new)
     if settings.features == "xfeat":
-        return match_learned(database, names, database.with_name("xfeat"))
+        return match_learned(database, names, database.with_name("xfeat"), new)
     pycolmap = load_pycolmap()
     with pycolmap.Database.open(database) as db:
         ids = {image.name: image.image_id for image in db.read_all_images()}
         known = [n for n in names if n in ids and db.num_keypoints_for_image(ids[n])]
         pairs = pairs_to_match(known, lambda name: db.read_descriptors(ids[name]).data)
         has = db.exists_matches, db.exists_two_view_geometry
-        missing = [(a, b) for a, b in pairs if not all(there(ids[a], ids[b]) for there in has)]
+        wanted = [pair for pair in pairs if not new.isdisjoint(pair)]
+        missing = [(a, b) for a, b in wanted if not all(there(ids[a], ids[b]) for there in has)]
     options = pycolmap.FeatureMatchingOptions(num_threads=_threads(5e8))
     listed = database.with_name("pairs.txt")
     pairing = pycolmap.ImportedPairingOptions(match_list_path=listed)
@@ -342,6 +368,16 @@ def _publish(models: list[pycolmap.Reconstruction], model: Path) -> None:
         raise UserError(f"{trouble}: make room, or choose --cache-dir") from error
 
 
+def write_picture(model: pycolmap.Reconstruction, doubtful: Collection[str], work: Path) -> None:
+    """Write the picture of a model's cameras and points into the folder of its report."""
+    posed = [image for image in model.images.values() if image.has_pose]
+    poses = np.stack([image.cam_from_world().inverse().matrix() for image in posed])
+    points = np.array([point.xyz for point in model.points3D.values()]).reshape(-1, 3)
+    png = BytesIO()
+    camera_picture(poses, [image.name for image in posed], doubtful, points).save(png, "PNG")
+    replace_file(work / PICTURE.name, png.getvalue())
+
+
 def _features_and_partners(database: Path) -> tuple[dict[str, int], Counter[str]]:
     """Count, for every photo, its features and the photos with which it has verified matches."""
     pycolmap = load_pycolmap()
@@ -399,7 +435,7 @@ def _threads(memory_each: float) -> int:
 
 
 @contextmanager
-def _quiet() -> Iterator[None]:
+def quiet() -> Iterator[None]:
     """Suppress COLMAP's log of thousands of lines; the report contains what matters."""
     logging = load_pycolmap().logging
     level, logging.minloglevel = logging.minloglevel, int(logging.FATAL)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,6 +14,8 @@ from lang3dxl_ns.common.files import read_json
 
 REPORT = Path("reconstruction/report.json")
 """File of the report in a scene's cache."""
+PICTURE = REPORT.with_name("cameras.png")
+"""File beside the report that shows cameras and points."""
 
 
 @dataclass
@@ -74,17 +77,29 @@ class ReconstructionReport:
                 f"{self.contradicting} pairs of photos match but contradict others, as different sides that "
                 "look alike do: they were left out"
             )
-        for what, photos in (("doubtfully placed", self.doubtful), ("left out", self.left_out)):
-            reasons: dict[str, list[str]] = {}
-            for name, why in photos.items():
-                reasons.setdefault(why, []).append(name)
-            found += [f"{what}, {why}: {some(names, 20)}" for why, names in reasons.items()]
+        found += reasons_in_words({"doubtfully placed": self.doubtful, "left out": self.left_out})
         if self.doubtful:
             found.append(
                 "a building that looks alike from several sides takes photos to the wrong one: look at the "
                 "doubtful ones in the viewer, and remove those that stand wrong"
             )
         return found
+
+
+def reasons_in_words(told: Mapping[str, Mapping[str, str]]) -> list[str]:
+    """Phrase what became of photos, by kind, name and reason: a line for each kind and reason."""
+    lines = []
+    for what, photos in told.items():
+        reasons: dict[str, list[str]] = {}
+        for name, why in photos.items():
+            reasons.setdefault(why, []).append(name)
+        lines += [f"{what}, {why}: {some(names, 20)}" for why, names in reasons.items()]
+    return lines
+
+
+def picture_line(work: Path) -> str:
+    """Name the picture of a reconstruction in its folder."""
+    return f"cameras and points from above and from the side: {work / PICTURE.name}"
 
 
 def doubtful_photos(cache_dir: Path) -> dict[str, str]:

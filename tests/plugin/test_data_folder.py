@@ -19,7 +19,7 @@ from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.plugin.datamanager import Lang3DXLDataManagerConfig
 from lang3dxl_ns.plugin.dataparser import PhotoCollectionDataParserConfig, parser_for
 from lang3dxl_ns.scene.layout import images_folder
-from lang3dxl_ns.scene.photo_folder import _sharpest, extract_frames
+from lang3dxl_ns.scene.photo_folder import _looks, _sharpest, extract_frames
 
 needs_ffmpeg = pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="ffmpeg is not installed")
 
@@ -200,7 +200,32 @@ def test_a_video_without_ffmpeg_is_an_error_that_names_it(tmp_path, monkeypatch)
 
 
 def test_of_every_stretch_the_sharpest_frame_is_taken():
-    assert _sharpest(np.array([1, 5, 2, 9, 0, 3, 4.0]), 3).tolist() == [1, 3, 6]
+    sharpness = np.array([1, 5, 2, 9, 0, 3, 4.0])
+    for steady in (np.zeros(7), np.ones(7)):
+        assert _sharpest(sharpness, steady, 3).tolist() == [1, 3, 6]
+
+
+def test_where_much_changes_more_frames_are_taken():
+    """Somebody stands still for half of the time, and then turns; a flash at the start changes nothing."""
+    change = np.repeat([0.0, 1.0], 500)
+    sharpness = np.random.default_rng(0).random(1000)
+    flash = change.copy()
+    flash[1:3] = 1e6
+    for motion in (change, flash):
+        chosen = _sharpest(sharpness, motion, 40)
+        assert len(chosen) == 40
+        assert 8 <= (chosen < 500).sum() <= 12  # a quarter
+
+
+@needs_ffmpeg
+def test_change_is_seen_in_a_video_in_spite_of_its_noise(tmp_path):
+    still = "color=gray:size=320x180:rate=10:duration=2,noise=alls=20:allf=t"
+    moving = "testsrc2=size=320x180:rate=10:duration=2"
+    graph = f"{still}[a];{moving}[b];[a][b]concat"
+    subprocess.run(["ffmpeg", "-v", "error", "-f", "lavfi", "-i", graph, str(tmp_path / "a.mp4")], check=True)
+    _, change = _looks(tmp_path / "a.mp4")
+    assert len(change) == 40
+    assert np.median(change[21:]) > 5 * np.median(change[1:20])
 
 
 @pytest.mark.parametrize("other", ["cache/reconstruction/sparse/0/images.bin", "scene/transforms.json"])

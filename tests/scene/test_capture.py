@@ -19,7 +19,7 @@ from lang3dxl_ns.scene.frame import Frame, find_frame, lost_cameras
 from lang3dxl_ns.scene.names import NameFinder, resolve
 from lang3dxl_ns.scene.photo_folder import find_photos, readable
 from lang3dxl_ns.scene.ply_points import read_ply_points
-from lang3dxl_ns.scene.reconstruct import _numbered
+from lang3dxl_ns.scene.reconstruct import numbered
 
 HEIC = (
     b"c-muNV30{GsVvAy%}izhg51nBLl8SRGck>Uf$?~5YDppk1Sn>t<P<^K3<a6VB@Af5Br_);Y>0~k0}}%yh{gCCLIXhqPz(r|v"
@@ -284,7 +284,7 @@ def test_colmap_gets_a_jpeg_of_a_heic_and_the_right_ending_of_others(tmp_path):
     (tmp_path / "a.heic").write_bytes(heic())
     Image.new("RGB", (8, 6)).save(tmp_path / "b.jfif", "JPEG")
     Image.new("RGB", (8, 6)).save(tmp_path / "c.jpe", "PNG")
-    copies = _numbered(find_photos(tmp_path), tmp_path / "work")
+    copies = numbered(find_photos(tmp_path), tmp_path / "work")
     assert copies.names == ("000000.jpg", "000001.jpg", "000002.png")
     with Image.open(copies.folder / "000000.jpg") as image:
         assert image.size == (24, 32)

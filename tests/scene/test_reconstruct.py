@@ -19,6 +19,8 @@ from lang3dxl_ns.scene.placements import cameras_of, doubtful_placements, matche
 from lang3dxl_ns.scene.reconstruct import reconstruct, reconstruct_scene
 from lang3dxl_ns.scene.reconstruction import ReconstructionSettings
 
+SIFT = ReconstructionSettings(features="sift")  # also where XFeat is installed
+
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
@@ -57,7 +59,7 @@ def pose_errors(model, given):
 def reconstructed(scene, tmp_path_factory):
     folder = tmp_path_factory.mktemp("reconstructed") / "data"
     shutil.copytree(scene / "images", folder / "images")
-    data, model = reconstruct_scene(folder)
+    data, model = reconstruct_scene(folder, None, SIFT)
     return data, model, scene / "given" / "0"
 
 
@@ -89,10 +91,20 @@ def test_a_model_that_many_photos_contradict_is_mapped_anew(photos, monkeypatch,
     """Nothing really contradicts here, so all photos keep a pose."""
     doubts = iter([{1: "it looks away"}, {}])
     monkeypatch.setattr(module, "_doubts", lambda database, model: next(doubts))
-    report = reconstruct(find_photos(photos), photos / "work", photos / "sparse")
+    report = reconstruct(find_photos(photos), photos / "work", photos / "sparse", SIFT)
     assert "mapping anew" in capsys.readouterr().out
     assert report.registered == 7
     assert not list((photos / "work").glob("tmp*"))
+
+
+def test_a_picture_shows_the_cameras_and_is_no_photo(reconstructed):
+    """With the cache in the photos' own folder, the picture lies among them."""
+    data, _, _ = reconstructed
+    work = data / "lang3dxl_cache" / "reconstruction"
+    with Image.open(work / "cameras.png") as image:
+        colors = {color for _, color in image.getcolors(image.width * image.height)}
+    assert {(165, 165, 165), (20, 90, 200)} <= colors
+    assert find_photos(work.parent).names == ()
 
 
 def test_all_photos_share_the_camera(reconstructed):
@@ -103,7 +115,7 @@ def test_all_photos_share_the_camera(reconstructed):
 def test_a_second_reconstruction_in_one_folder_ends_at_once(photos):
     work = photos / "lang3dxl_cache" / "reconstruction"
     with locked(work), pytest.raises(UserError, match=r"another command reconstructs in .*reconstruction"):
-        reconstruct_scene(photos)
+        reconstruct_scene(photos, None, SIFT)
     assert not list(work.iterdir())
 
 
@@ -120,7 +132,7 @@ def test_names_with_spaces_formats_of_the_web_and_odd_bytes(photos):
         image.convert("RGB").save(folder / "Foto 4 (ä).jpg", format="WEBP", quality=95)
     os.remove(folder / "Foto 5 (ä).jpg")
     os.rename(folder / "photo_006.jpg", os.fsencode(folder) + b"/caf\xe9.jpg")
-    report = reconstruct(find_photos(photos), photos / "work", photos / "sparse")
+    report = reconstruct(find_photos(photos), photos / "work", photos / "sparse", SIFT)
     assert report.registered == 7
     (odd,) = (name for name, why in report.left_out.items() if "rename" in why)
     assert odd.startswith("caf")
@@ -133,7 +145,7 @@ def test_a_model_that_is_there_is_left_as_it_is(photos, capsys):
     (photos / "sparse" / "0").mkdir(parents=True)
     (photos / "sparse" / "0" / "images.bin").write_bytes(b"precious")
     with pytest.raises(UserError, match="already exists"):
-        reconstruct_scene(photos)
+        reconstruct_scene(photos, None, SIFT)
     assert "without a COLMAP model" not in capsys.readouterr().out
     assert (photos / "sparse" / "0" / "images.bin").read_bytes() == b"precious"
 
@@ -141,7 +153,7 @@ def test_a_model_that_is_there_is_left_as_it_is(photos, capsys):
 def test_where_sparse_is_taken_the_model_goes_to_the_cache(photos):
     (photos / "sparse").mkdir()
     (photos / "sparse" / "notes.txt").write_text("mine")
-    _, model = reconstruct_scene(photos)
+    _, model = reconstruct_scene(photos, None, SIFT)
     assert model == photos / "lang3dxl_cache" / "reconstruction" / "sparse" / "0"
     assert [path.name for path in (photos / "sparse").iterdir()] == ["notes.txt"]
 
@@ -162,7 +174,7 @@ def test_a_stopped_reconstruction_goes_on_with_what_it_has(photos, monkeypatch):
     monkeypatch.setattr(pycolmap, "match_image_pairs", stopped)
     monkeypatch.setattr(module, "_CHUNK_PAIRS", 10)
     with pytest.raises(KeyboardInterrupt):
-        reconstruct_scene(photos)
+        reconstruct_scene(photos, None, SIFT)
     assert not (photos / "sparse").exists()
 
     matched = []
@@ -174,7 +186,7 @@ def test_a_stopped_reconstruction_goes_on_with_what_it_has(photos, monkeypatch):
             match(database, options, pairing),
         ),
     )
-    reconstruct_scene(photos)
+    reconstruct_scene(photos, None, SIFT)
     assert sorted(extracted) == [f"{i:06d}.jpg" for i in range(7)]  # each once
     assert len(matched) == 7 * 6 // 2 - 10
 
@@ -183,15 +195,15 @@ def test_photos_in_a_folder_of_that_name_beside_the_work_stay(photos, tmp_path):
     """As with `reconstruct --data castle/reconstruction/photos --cache-dir castle`."""
     own = tmp_path / "reconstruction" / "photos"
     shutil.copytree(photos / "images", own)
-    module._numbered(find_photos(own), own.parent)
+    module.numbered(find_photos(own), own.parent)
     assert find_photos(own).names == find_photos(photos).names
 
 
 def test_other_photos_begin_anew(photos):
-    reconstruct_scene(photos)
+    reconstruct_scene(photos, None, SIFT)
     shutil.rmtree(photos / "sparse")
     (photos / "images" / "photo_006.jpg").unlink()
-    assert len(read_reconstruction(reconstruct_scene(photos)[1]).photos) == 6
+    assert len(read_reconstruction(reconstruct_scene(photos, None, SIFT)[1]).photos) == 6
 
 
 def test_photos_that_do_not_fit_are_named_with_the_reason(photos, capsys):
@@ -202,7 +214,7 @@ def test_photos_that_do_not_fit_are_named_with_the_reason(photos, capsys):
     (folder / "broken.jpg").write_bytes(b"no photo")
     (folder / "camera.nef").write_bytes(b"no photo")
     shutil.copy(folder / "photo_000.jpg", folder / "twin.jpg")
-    report = reconstruct(find_photos(photos), photos / "work", photos / "sparse")
+    report = reconstruct(find_photos(photos), photos / "work", photos / "sparse", SIFT)
     assert report.registered == 7
     assert report.photos == 12
     reasons = report.left_out
@@ -221,7 +233,7 @@ def test_of_two_buildings_the_larger_is_used_and_the_other_told(photos, tmp_path
         write_scene(tmp_path / "other", photos=4, size=(240, 180))
     for path in (tmp_path / "other" / "images").iterdir():
         shutil.copy(path, photos / "images" / f"other_{path.name}")
-    report = reconstruct(find_photos(photos), photos / "work", photos / "sparse")
+    report = reconstruct(find_photos(photos), photos / "work", photos / "sparse", SIFT)
     assert report.registered == 7
     assert report.other_models == (4,)
     assert report.left_out["other_photo_000.jpg"] == "in a separate model of 4 photos"
@@ -252,7 +264,7 @@ def picture(folder, count, paint):
 )
 def test_what_makes_no_scene_is_told_in_words(tmp_path, count, paint, message):
     with pytest.raises(UserError, match=message):
-        reconstruct_scene(picture(tmp_path / "data", count, paint))
+        reconstruct_scene(picture(tmp_path / "data", count, paint), None, SIFT)
     assert not (tmp_path / "data" / "sparse").exists()
 
 
@@ -271,4 +283,4 @@ def test_a_still_camera_is_told_from_a_walk(photos, tmp_path):
         return (view + noise).clip(0, 255).astype(np.uint8)
 
     with pytest.raises(UserError, match="from one place"):
-        reconstruct_scene(picture(tmp_path / "still", 4, paint))
+        reconstruct_scene(picture(tmp_path / "still", 4, paint), None, SIFT)

@@ -1,0 +1,341 @@
+"""New photos for an existing COLMAP model, which keeps its cameras, poses and points.
+
+Features of the new photos are matched with those of the model's photos, whose keypoints tell the points that
+the matches show. A photo's pose follows from its points alone, so nothing of the model has to move.
+"""
+
+from __future__ import annotations
+
+import filecmp
+import json
+import os
+import shutil
+from collections import Counter
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Float, Int64
+from numpy import ndarray as Array
+from scipy.spatial import KDTree
+
+from lang3dxl_ns.common.console import say
+from lang3dxl_ns.common.errors import DAMAGE, UserError
+from lang3dxl_ns.common.files import expanded, locked, make_folder, read_json, replace_file
+from lang3dxl_ns.scene.colmap import load_pycolmap, read_reconstruction
+from lang3dxl_ns.scene.companions import cache_folder, inside
+from lang3dxl_ns.scene.layout import find_model, has_model, images_folder
+from lang3dxl_ns.scene.learned_features import features_for
+from lang3dxl_ns.scene.photo_folder import PhotoFolder, find_photos, shared_cameras
+from lang3dxl_ns.scene.placements import doubtful_placements, matched_pairs
+from lang3dxl_ns.scene.reconstruct import (
+    check_settings,
+    extract,
+    feature_database,
+    match,
+    numbered,
+    quiet,
+    usable,
+    write_picture,
+)
+from lang3dxl_ns.scene.reconstruction import (
+    REPORT,
+    ReconstructionSettings,
+    doubtful_photos,
+    picture_line,
+    reasons_in_words,
+)
+
+if TYPE_CHECKING:
+    import pycolmap
+
+_LEAST_POINTS = 30
+"""Fewest points that agree on a photo's pose, as in COLMAP's mapper."""
+_NEAR = 0.0015
+"""Distance from a keypoint of the model to a feature of the same place, relative to the longer side."""
+_FOCAL = 0.1, 10.0  # plausible focal lengths, relative to the longer side
+_ERROR = 0.005
+"""Largest distance of a point from its pixel that agrees with a pose, relative to the longer side."""
+_TRUST = 1.1
+"""How many times as many points must agree with a camera of its own as with one of the model's."""
+_PARTS = ("cameras", "images", "points3D", "rigs", "frames")
+
+
+@dataclass(frozen=True, eq=False)
+class _Placed:
+    """Pose of a new photo."""
+
+    camera: pycolmap.Camera
+    camera_from_world: pycolmap.Rigid3d
+    points: Int64[Array, " n"]
+    """Number of the point that each keypoint shows; −1 for none."""
+
+
+def add_photos(
+    data: Path, folder: Path, cache_dir: Path | None = None, settings: ReconstructionSettings | None = None
+) -> Path:
+    """Add the photos of a folder to a scene's model, or resume an earlier attempt, and return the model.
+
+    Photos that find a place are copied to a folder of the same name beside the scene's. The model as it was
+    is kept in the cache. Raises UserError without a model, its photos or new ones, for names that are taken,
+    and if no photo finds a place.
+
+    Args:
+        data: the scene's folder, with photos and a COLMAP model.
+        folder: new photos; may lie among the scene's.
+        cache_dir: folder for features and matches; by default lang3dxl_cache in `data`.
+        settings: as for `reconstruct`; the mapper has no meaning here.
+    """
+    settings = settings or ReconstructionSettings()
+    check_settings(settings)
+    data, folder = expanded(data).absolute(), expanded(folder).absolute()
+    work = cache_folder(data, cache_dir).absolute() / REPORT.parent
+    place = find_model(data) or work / "sparse" / "0"
+    if not has_model(place):
+        raise UserError(f"{data} has no COLMAP model to add to: reconstruct it first, without --add")
+    images = images_folder(data, place)
+    old = [name for name in read_reconstruction(place).photos if inside(images, name).is_file()]
+    if not old:
+        raise UserError(f"none of the photos in the model {place} is in {images}: put them there")
+    for written in (images, place.parent):
+        if not os.access(written, os.W_OK):
+            raise UserError(f"{written} can't be written to: copy the scene to where it can")
+    targets = _targets(folder, images, set(old))
+    work = work / "adding"
+    with locked(work, busy=f"another command adds photos in {work}: wait for it, or end it"), quiet():
+        good, left_out = usable(PhotoFolder(images, (*old, *targets)))
+        settings = replace(settings, features=features_for(len(good.names), settings.features))
+        copies = numbered(good, work)
+        database = feature_database(good, copies, work, settings)
+        extract(database, copies, settings)
+        number = dict(zip(good.names, copies.names, strict=True))
+        match(database, copies.names, settings, {number[name] for name in targets if name in number})
+        model = load_pycolmap().Reconstruction(place)
+        with load_pycolmap().Database.open(database) as db:
+            ids = {name: db.read_image_with_name(number[name]).image_id for name in good.names}
+            scene = _Scene(model, db, {ids[name]: name for name in good.names}, good)
+            placed = scene.place_all([ids[name] for name in targets if name in ids])
+            doubtful = scene.doubts(placed)
+            found = {scene.names[i]: (i, photo) for i, photo in placed.items()}
+            for name, (i, photo) in found.items():
+                _add(model, photo, targets[name], db.read_keypoints(i)[:, :2].astype(float))
+    lost = {targets[n]: left_out.get(n, "too few of its matches agree") for n in targets if n not in found}
+    doubtful = {targets[name]: why for name, why in doubtful.items()}
+    told = reasons_in_words({"without a place": lost, "doubtfully placed": doubtful})
+    if not found:
+        raise UserError(f"none of the {len(targets)} new photos finds a place; {'; '.join(told)}")
+    _copy(images, {name: targets[name] for name in found})
+    kept = _replace(place, model, work.parent)
+    write_picture(model, doubtful | doubtful_photos(work.parent.parent), work.parent)
+    _report(work.parent / REPORT.name, len(targets), len(found), doubtful)
+    say(f"{len(found)} of {len(targets)} new photos have a pose; the model as it was is in {kept}", *told)
+    say(picture_line(work.parent))
+    return place
+
+
+def _targets(folder: Path, images: Path, known: set[str]) -> dict[str, str]:
+    """Name the new photos: relative to the scene's, where they are → where they will be."""
+    photos = find_photos(folder)
+    targets = {}
+    for name in photos.names:
+        path = photos.folder / name
+        within = path.is_relative_to(images)
+        target = path.relative_to(images).as_posix() if within else f"{folder.name}/{name}"
+        if target in known:
+            continue
+        if not within and (images / target).exists() and not filecmp.cmp(path, images / target, False):
+            raise UserError(f"{images / target} is another photo: rename the folder {folder}")
+        targets[os.path.relpath(path, images)] = target
+    if not targets:
+        raise UserError(f"{folder} holds no photos that the model lacks")
+    return targets
+
+
+class _Scene:
+    """A model, and features of its photos and new ones, by their numbers in the database."""
+
+    def __init__(
+        self,
+        model: pycolmap.Reconstruction,
+        database: pycolmap.Database,
+        names: dict[int, str],
+        photos: PhotoFolder,
+    ) -> None:
+        self.names = names
+        self._database = database
+        self._positions = {number: point.xyz for number, point in model.points3D.items()}
+        self._rotations: dict[int, Float[Array, "3 3"]] = {}
+        self._cameras: dict[int, pycolmap.Camera] = {}
+        self._points: dict[int, Int64[Array, " n"]] = {}
+        """Number of the point that each feature shows, for photos with a pose; −1 for none."""
+        images = {image.name: image for image in model.images.values() if image.has_pose}
+        own = {name: model.cameras[image.camera_id] for name, image in images.items()}
+        self._shared: dict[str, pycolmap.Camera | None] = {}
+        for group in shared_cameras(photos):
+            known = next((own[name] for name in group if name in own), None)
+            self._shared |= dict.fromkeys(group, known)
+        uses = Counter(image.camera_id for image in images.values())
+        sizes = Counter((camera.width, camera.height) for camera in own.values())
+        self._usual = {
+            (camera.width, camera.height): camera
+            for camera in model.cameras.values()
+            if uses[camera.camera_id] > max(2, sizes[camera.width, camera.height] / 2)
+        }
+        """Cameras that took most photos of their size."""
+        for number, name in names.items():
+            if name in images:
+                self._points[number] = self._shown(number, images[name], own[name])
+                self._cameras[number] = own[name]
+                self._rotations[number] = images[name].cam_from_world().rotation.matrix()
+
+    def _stored(self, number: int) -> pycolmap.Camera:
+        return self._database.read_camera(self._database.read_image(number).camera_id)
+
+    def _shown(self, number: int, image: pycolmap.Image, camera: pycolmap.Camera) -> Int64[Array, " n"]:
+        """Find the points that features of a photo in the model show, by its keypoints there."""
+        stored, keypoints = self._stored(number), self._database.read_keypoints(number)[:, :2]
+        seen = [point for point in image.points2D if point.has_point3D()]
+        if not seen or not len(keypoints):
+            return np.full(len(keypoints), -1)
+        scale = np.array([camera.width / stored.width, camera.height / stored.height])
+        near = _NEAR * max(camera.width, camera.height)
+        tree = KDTree(np.array([point.xy for point in seen]))
+        distances, nearest = tree.query(keypoints * scale, distance_upper_bound=near)
+        points = np.array([*(point.point3D_id for point in seen), -1], np.int64)
+        return points[np.where(np.isfinite(distances), nearest, -1)]
+
+    def place_all(self, new: Sequence[int]) -> dict[int, _Placed]:
+        """Place new photos, one after the other: a placed one may tell the points of the next."""
+        matches = {photo: self._matches(photo) for photo in new}
+        placed: dict[int, _Placed] = {}
+        while True:
+            before = len(placed)
+            for photo in [photo for photo in new if photo not in placed]:
+                if found := self._place(photo, matches[photo]):
+                    placed[photo] = found
+                    self._points[photo], self._cameras[photo] = found.points, found.camera
+                    self._rotations[photo] = found.camera_from_world.rotation.matrix()
+            if len(placed) == before:
+                return placed
+
+    def _matches(self, photo: int) -> dict[int, Int64[Array, "m 2"]]:
+        """Read a photo's verified matches with others: its feature, the other's."""
+        geometry = self._database.read_two_view_geometry
+        others = [n for n in self.names if n != photo and self._database.exists_two_view_geometry(photo, n)]
+        return {n: np.asarray(geometry(photo, n).inlier_matches, np.int64).reshape(-1, 2) for n in others}
+
+    def _place(self, photo: int, matches: dict[int, Int64[Array, "m 2"]]) -> _Placed | None:
+        rows = [
+            np.column_stack([pairs[:, 0], self._points[other][pairs[:, 1]]])
+            for other, pairs in matches.items()
+            if other in self._points
+        ]
+        shown, votes = np.unique(
+            np.concatenate([np.zeros((0, 2), np.int64), *rows]), axis=0, return_counts=True
+        )
+        shown = shown[np.argsort(-votes, kind="stable")]
+        shown = shown[shown[:, 1] >= 0]
+        for column in (0, 1):  # a feature shows one point, and a point is seen once
+            shown = shown[np.sort(np.unique(shown[:, column], return_index=True)[1])]
+        if len(shown) < _LEAST_POINTS:
+            return None
+        keypoints = self._database.read_keypoints(photo)
+        pixels = keypoints[shown[:, 0], :2].astype(float)
+        positions = np.stack([self._positions[point] for point in shown[:, 1].tolist()])
+        best, most = None, float(_LEAST_POINTS)
+        for camera, fixed in self._cameras_for(photo):
+            found = _solve(camera, fixed, pixels, positions)
+            if found and found["num_inliers"] >= most:
+                best, most = (camera, found), found["num_inliers"] * _TRUST
+        if best is None:
+            return None
+        agreeing = shown[np.asarray(best[1]["inlier_mask"], bool)]
+        points = np.full(len(keypoints), -1)
+        points[agreeing[:, 0]] = agreeing[:, 1]
+        return _Placed(best[0], best[1]["cam_from_world"], points)
+
+    def _cameras_for(self, photo: int) -> list[tuple[pycolmap.Camera, bool]]:
+        """Return the cameras that may have taken a photo, and whether each is fixed: one of the model's by
+        EXIF, or by size where EXIF is silent, and the photo's own."""
+        own = self._stored(photo)
+        size = own.width, own.height
+        known = self._shared[self.names[photo]]
+        if known is None and not own.has_prior_focal_length:
+            known = self._usual.get(size)
+        fits = known is not None and (known.width, known.height) == size
+        return [*([(type(own)(known.todict()), True)] if known and fits else []), (own, False)]
+
+    def doubts(self, placed: dict[int, _Placed]) -> dict[str, str]:
+        """Find new photos whose matches contradict their place, with reasons."""
+        pairs = matched_pairs(self._database, self._cameras)
+        reasons = doubtful_placements(self._rotations, pairs)
+        return {self.names[number]: why for number, why in reasons.items() if number in placed}
+
+
+def _solve(
+    camera: pycolmap.Camera, fixed: bool, pixels: Float[Array, "n 2"], points: Float[Array, "n 3"]
+) -> dict[str, Any] | None:
+    """Find a photo's pose by the points that its pixels show, with COLMAP's answer, and its lens unless that
+    is `fixed`."""
+    estimation = {
+        "estimate_focal_length": not fixed and not camera.has_prior_focal_length,
+        "ransac": {"random_seed": 0, "max_error": _ERROR * max(camera.width, camera.height)},
+    }
+    refinement = {"refine_focal_length": not fixed, "refine_extra_params": not fixed}
+    estimate = load_pycolmap().estimate_and_refine_absolute_pose
+    found: dict[str, Any] | None = estimate(pixels, points, camera, estimation, refinement)
+    focal = camera.mean_focal_length() / max(camera.width, camera.height)
+    return found if _FOCAL[0] < focal < _FOCAL[1] else None
+
+
+def _add(model: pycolmap.Reconstruction, photo: _Placed, name: str, keypoints: Float[Array, "n 2"]) -> None:
+    """Add a placed photo to the model, under new numbers."""
+    pycolmap = load_pycolmap()
+    photo.camera.camera_id = max([*model.cameras, *model.rigs]) + 1
+    model.add_camera_with_trivial_rig(photo.camera)
+    number = max([*model.images, *model.frames]) + 1
+    image = pycolmap.Image(name, keypoints, photo.camera.camera_id, number)
+    model.add_image_with_trivial_frame(image, photo.camera_from_world)
+    for feature in np.flatnonzero(photo.points >= 0).tolist():
+        model.add_observation(int(photo.points[feature]), pycolmap.TrackElement(number, feature))
+
+
+def _copy(images: Path, targets: dict[str, str]) -> None:
+    """Copy photos from where they are to where they belong."""
+    for name, target in targets.items():
+        if not (images / target).exists():
+            make_folder((images / target).parent)
+            shutil.copy2(images / name, images / target)
+
+
+def _report(path: Path, photos: int, placed: int, doubtful: dict[str, str]) -> None:
+    """Update the model's report, if it has one: doubtful photos are asked for there."""
+    with suppress(*DAMAGE):
+        told = read_json(path)
+        told["photos"] += photos
+        told["registered"] += placed
+        told["doubtful"] |= doubtful
+        replace_file(path, json.dumps(told, indent=2))
+
+
+def _replace(place: Path, model: pycolmap.Reconstruction, work: Path) -> Path:
+    """Replace a model's files, in their format, and return the folder of its copy."""
+    forms = (work / f"before_adding_{number}" for number in range(1, 10_000))
+    kept = next(form for form in forms if not form.exists())
+    with TemporaryDirectory(prefix=f".{place.name}.", dir=place.parent) as folder:
+        shutil.copytree(place, Path(folder) / "kept")
+        shutil.move(Path(folder) / "kept", kept)
+        complete = Path(folder) / "complete"
+        shutil.copytree(place, complete)
+        write = model.write_binary if (place / "images.bin").exists() else model.write_text
+        for part in _PARTS:
+            for ending in (".bin", ".txt"):
+                (complete / f"{part}{ending}").unlink(missing_ok=True)
+        write(complete)
+        place.rename(Path(folder) / "old")
+        complete.rename(place)
+    return kept

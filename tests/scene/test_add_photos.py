@@ -1,0 +1,195 @@
+"""New photos for a model: they find their places, and nothing of the model moves or is lost."""
+
+import json
+import shutil
+
+import numpy as np  # before pycolmap
+import pycolmap
+import pytest
+import scenes
+from PIL import Image
+from scenes import speckled, write_scene
+
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.scene import add_photos as module
+from lang3dxl_ns.scene.add_photos import add_photos
+from lang3dxl_ns.scene.colmap import read_reconstruction
+from lang3dxl_ns.scene.photo_folder import find_photos
+from lang3dxl_ns.scene.reconstruct import reconstruct_scene
+from lang3dxl_ns.scene.reconstruction import ReconstructionSettings, doubtful_photos
+
+SIFT = ReconstructionSettings(features="sift")
+LATE = ("photo_002.jpg", "photo_005.jpg")
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A reconstruction of five photos of a speckled box, two further photos in late/, and the true model."""
+    folder = tmp_path_factory.mktemp("made")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(scenes, "texture", speckled)
+        write_scene(folder / "true", photos=7, size=(240, 180))
+    shutil.copytree(folder / "true" / "images", folder / "data" / "images")
+    (folder / "late").mkdir()
+    for name in LATE:
+        shutil.move(folder / "data" / "images" / name, folder / "late" / name)
+    reconstruct_scene(folder / "data", None, SIFT)
+    return folder
+
+
+@pytest.fixture
+def scene(made, tmp_path):
+    shutil.copytree(made, tmp_path / "copy")
+    return tmp_path / "copy"
+
+
+def contents(model):
+    """What must not change, by number: cameras, poses and points."""
+    model = pycolmap.Reconstruction(model)
+    images = {i: (m.name, m.cam_from_world().matrix().tobytes()) for i, m in model.images.items()}
+    cameras = {i: (camera.model_name, camera.params.tobytes()) for i, camera in model.cameras.items()}
+    points = {i: (point.xyz.tobytes(), point.color.tobytes()) for i, point in model.points3D.items()}
+    return images, cameras, points
+
+
+def errors(model, true):
+    """Distances of all cameras from the true ones once aligned, by name."""
+    found, known = read_reconstruction(model).photos, read_reconstruction(true).photos
+    true_names = {name: name.rsplit("/", 1)[-1] for name in found}
+    places = [
+        np.array([p.center for p in found.values()]),
+        np.array([known[n].center for n in true_names.values()]),
+    ]
+    align = pycolmap.estimate_sim3d(*places)
+    return dict(
+        zip(found, np.linalg.norm([align * a - b for a, b in zip(*places, strict=True)], axis=1), strict=True)
+    )
+
+
+def test_new_photos_find_their_places_and_nothing_else_moves(scene, capsys):
+    before = contents(scene / "data/sparse/0")
+    model = add_photos(scene / "data", scene / "late", None, SIFT)
+    assert model == scene / "data" / "sparse" / "0"
+    after = contents(model)
+    for old, new in zip(before, after, strict=True):
+        assert old.items() <= new.items()
+    assert len(after[0]) == 7 and after[2].keys() == before[2].keys()
+    distances = errors(model, scene / "true/sparse/0")
+    assert max(distances[f"late/{name}"] for name in LATE) < 0.15  # of about 4 to the box
+    photos = read_reconstruction(model).photos
+    assert all(len(photos[f"late/{name}"].points) >= 30 for name in LATE)  # depth for crops in physical scale
+    assert {f"late/{name}" for name in LATE} <= set(find_photos(scene / "data").names)
+    assert "2 of 2 new photos have a pose" in capsys.readouterr().out
+
+
+def late_cameras(model):
+    model = pycolmap.Reconstruction(model)
+    late = [image for image in model.images.values() if image.name.startswith("late/")]
+    return [model.cameras[image.camera_id].params for image in late], model.cameras[1].params
+
+
+def test_a_photo_of_the_size_that_one_camera_of_the_model_takes_has_its_lens(scene):
+    params, old = late_cameras(add_photos(scene / "data", scene / "late", None, SIFT))
+    assert all((found == old).all() for found in params)
+
+
+def test_a_photo_of_another_size_finds_its_own_lens(scene):
+    for name in LATE:
+        with Image.open(scene / "late" / name) as image:
+            image.resize((320, 240), Image.Resampling.LANCZOS).save(scene / "late" / name, quality=97)
+    model = add_photos(scene / "data", scene / "late", None, SIFT)
+    params, old = late_cameras(model)
+    assert all(abs(found[0] / old[0] - 320 / 240) < 0.15 for found in params)
+    distances = errors(model, scene / "true/sparse/0")
+    assert max(distances[f"late/{name}"] for name in LATE) < 0.3  # of about 4 to the box
+
+
+def test_the_report_and_the_picture_know_the_new_photos(scene, monkeypatch):
+    work = scene / "data/lang3dxl_cache/reconstruction"
+    before = (work / "cameras.png").read_bytes()
+    monkeypatch.setattr(module, "doubtful_placements", lambda *_: dict.fromkeys(range(1, 8), "it looks away"))
+    add_photos(scene / "data", scene / "late", None, SIFT)
+    assert doubtful_photos(work.parent) == {f"late/{name}": "it looks away" for name in LATE}
+    assert json.loads((work / "report.json").read_text())["registered"] == 7
+    assert (work / "cameras.png").read_bytes() != before
+
+
+def test_the_model_as_it_was_is_kept(scene):
+    files = {path.name: path.read_bytes() for path in (scene / "data/sparse/0").iterdir()}
+    add_photos(scene / "data", scene / "late", None, SIFT)
+    kept = scene / "data/lang3dxl_cache/reconstruction/before_adding_1"
+    assert {path.name: path.read_bytes() for path in kept.iterdir()} == files
+    with pytest.raises(UserError, match="holds no photos that the model lacks"):
+        add_photos(scene / "data", scene / "late", None, SIFT)
+
+
+def test_photos_without_a_place_are_named_and_not_copied(scene, capsys):
+    noise = np.random.default_rng(0).integers(0, 255, (180, 240, 3), np.uint8)
+    Image.fromarray(noise).save(scene / "late" / "noise.jpg")
+    shutil.copy(scene / "data/images/photo_000.jpg", scene / "late" / "twin.jpg")
+    model = add_photos(scene / "data", scene / "late", None, SIFT)
+    told = capsys.readouterr().out
+    assert "2 of 4 new photos" in told
+    assert "too few of its matches agree: late/noise.jpg" in told
+    assert "the same file as photo_000.jpg: late/twin.jpg" in told
+    assert len(read_reconstruction(model).photos) == 7
+    assert sorted(path.name for path in (scene / "data/images/late").iterdir()) == list(LATE)
+
+
+def test_where_no_photo_finds_a_place_the_model_stays(scene):
+    before = (scene / "data/sparse/0/images.bin").read_bytes()
+    noise = np.random.default_rng(0).integers(0, 255, (180, 240, 3), np.uint8)
+    (scene / "other").mkdir()
+    Image.fromarray(noise).save(scene / "other" / "noise.jpg")
+    with pytest.raises(UserError, match=r"none of the 1 new photos finds a place.*other/noise\.jpg"):
+        add_photos(scene / "data", scene / "other", None, SIFT)
+    assert (scene / "data/sparse/0/images.bin").read_bytes() == before
+    assert not (scene / "data/images/other").exists()
+
+
+def test_another_photo_of_that_name_is_never_overwritten(scene):
+    taken = scene / "data/images/late"
+    taken.mkdir()
+    (taken / LATE[0]).write_bytes(b"mine")
+    with pytest.raises(UserError, match="is another photo: rename the folder"):
+        add_photos(scene / "data", scene / "late", None, SIFT)
+    assert (taken / LATE[0]).read_bytes() == b"mine"
+
+
+def test_a_model_as_text_of_unknown_features_and_photos_that_lie_among_its_own(scene):
+    data = scene / "data"
+    model = pycolmap.Reconstruction(data / "sparse/0")
+    shutil.rmtree(data / "sparse/0")
+    shutil.rmtree(data / "lang3dxl_cache")
+    (data / "sparse/0").mkdir()
+    model.write_text(data / "sparse/0")
+    for name in LATE:
+        shutil.move(scene / "late" / name, data / "images" / name)
+    place = add_photos(data, data / "images", None, SIFT)
+    assert (place / "images.txt").is_file() and not (place / "images.bin").exists()
+    distances = errors(place, scene / "true/sparse/0")
+    assert len(distances) == 7 and max(distances.values()) < 0.15
+
+
+def test_a_stopped_addition_goes_on_with_what_it_has(scene, monkeypatch):
+    def stopped(*arguments):
+        raise KeyboardInterrupt
+
+    match = module.match
+    monkeypatch.setattr(module, "match", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        add_photos(scene / "data", scene / "late", None, SIFT)
+    monkeypatch.setattr(module, "match", match)
+    assert len(read_reconstruction(scene / "data/sparse/0").photos) == 5
+
+    def again(*arguments, **options):
+        raise AssertionError("features are extracted twice")
+
+    monkeypatch.setattr(pycolmap, "extract_features", again)
+    assert len(read_reconstruction(add_photos(scene / "data", scene / "late", None, SIFT)).photos) == 7
+
+
+def test_without_a_model_the_way_to_one_is_told(scene):
+    shutil.rmtree(scene / "data/sparse")
+    with pytest.raises(UserError, match="reconstruct it first, without --add"):
+        add_photos(scene / "data", scene / "late", None, SIFT)
