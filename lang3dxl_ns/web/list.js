@@ -40,7 +40,7 @@ export class List extends EventTarget {
   part(prompt) {
     if (!prompt.found) return null;
     const { things } = prompt.found, small = (label, act, more) => element("button", { className: "small", onclick: act, ...more }, label);
-    const summary = element("summary", {}, things.length ? `${count(prompt.found)} found` : "No single things found");
+    const summary = element("summary", {}, things.length ? `${count(prompt.found)} found${this.about.detail ? " in the coarse scene" : ""}` : "No single things found");
     const made = element("details", { className: "things", open: Boolean(prompt.listed) }, summary);
     summary.addEventListener("click", (event) => {
       event.preventDefault();

@@ -1,5 +1,5 @@
 // The page: the search box and its prompts, answers to clicks, words that are taught, and the keys.
-import { element, explain, matched, percent, promptCard, say, shown } from "./cards.js";
+import { element, explain, matched, percent, promptCard, say, shown, wholeCount } from "./cards.js";
 import { Detail } from "./detail.js";
 import { isQuestion } from "./grammar.js";
 import { Kept, readFields, Steps, written, MOST_PROMPTS } from "./history.js";
@@ -38,7 +38,7 @@ async function answer(prompt) {
   if (prompt.examples && !prompt.examples.length) return Object.assign(prompt, { known: true, relevancy: null, threshold: null });
   const found = await think("ask", { ...question(prompt), threshold: prompt.chosen });
   if (turn !== prompt.turn || !found.known) return found;
-  return Object.assign(prompt, found, { views: null, box: null, finding: null });
+  return Object.assign(prompt, found, { matching: wholeCount(found.matching, about), views: null, box: null, finding: null });
 }
 
 /** Answer all prompts anew, once the common negatives have changed. */
@@ -156,7 +156,7 @@ function draw(newest = null) {
   list.tidy();
   const [from, label] = [prompts.find(({ card }) => card?.contains(focused)), focused?.ariaLabel ?? focused?.textContent];
   for (const prompt of prompts) {
-    prompt.card = promptCard(prompt, acts);
+    prompt.card = promptCard(prompt, acts, about);
     prompt.card.append(list.part(prompt) ?? "");
   }
   $("prompts").replaceChildren(...prompts.map(({ card }) => card));
@@ -218,8 +218,9 @@ function rename(prompt, name) {
 function dragThreshold(prompt, value) {
   let count = 0;
   for (const relevancy of prompt.relevancy) count += relevancy > value;
-  Object.assign(prompt, { chosen: value, threshold: value, matching: count, dragged: true });
-  prompt.card.querySelector(".count").textContent = matched(count);
+  const matching = wholeCount(count, about);
+  Object.assign(prompt, { chosen: value, threshold: value, matching, dragged: true });
+  prompt.card.querySelector(".count").textContent = matched(matching, about);
   const end = prompt.card.querySelector(".ends span");
   if (end) end.textContent = value.toFixed(2);
   view.recolor(prompts.filter((one) => one.relevancy));
