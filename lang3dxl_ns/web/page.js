@@ -9,13 +9,14 @@ import { distanceAsText } from "./measure.js";
 import { Photos } from "./photos.js";
 import { areExamples, asPython, drawOutline, examplesAsText, examplesFromText, inside, rounded, UNNAMED, wordsFile } from "./teach.js";
 import { thinker } from "./think.js";
+import { Tour } from "./tour.js";
 import { parsePrompts, tidy } from "./vocabulary.js";
 import { View } from "./view.js";
 
 const TYPING = 500, MOST_TRIED = 6, TIE = 0.02; // milliseconds until negatives take effect; suggested words; relevancies that tell words apart
 const $ = (id) => document.getElementById(id);
 const prompts = [], taughtHere = new Set(); // names that were taught to the server's scene from here
-let about, view, photos, list, steps, kept, latest = null, settled = false, cleared = 0; // settled: the address has been read; cleared: how often all prompts were removed
+let about, view, photos, list, tour, steps, kept, latest = null, settled = false, cleared = 0; // settled: the address has been read; cleared: how often all prompts were removed
 let ends = [], outlining = null, chosenLook = "";
 
 const think = thinker(
@@ -381,9 +382,10 @@ function asField(prompt) {
   return { kind: examples ? "like" : "ask", text: examples ? examplesAsText(prompt.text, examples) : asTyped(prompt), at: chosen, hue: about.colors.indexOf(color) };
 }
 
-/** What is shown, as an address. */
-const shownNow = () =>
+/** What is shown, as an address. stops: of the tour. */
+const shownNow = (stops = tour.fields) =>
   written({
+    stops,
     view: view.mover.address, walk: view.mover.walking ? 1 : "", not: $("not").value, hide: Number($("hide").value) || "", look: chosenLook,
     boxes: $("boxed").checked ? 1 : "", cameras: $("cameras").ariaPressed === "true" ? 1 : "", photo: photos.shown?.name, ...list.fields,
     prompts: prompts.filter(({ examples }) => !examples || examples.length).map(asField),
@@ -394,13 +396,15 @@ function keepAddress(own = false) {
   if (settled) steps.keep(shownNow(), own);
 }
 
-/** Show what an address says. Prompts that are shown already stay as they are. */
-async function apply(hash, turn = drop()) {
+/** Show what an address says, after a flight if it is a stop of the tour. Prompts that are shown already stay as they are. */
+async function apply(hash, turn = drop(), isStop = false) {
   const wanted = readFields(hash), found = [], open = prompts.find((prompt) => prompt.open)?.text;
   settled = false;
   outlining?.abort();
   photos.hide();
-  if (wanted.view) view.mover.address = wanted.view;
+  if (!isStop) Object.assign(tour, { fields: wanted.stops }).stop();
+  if (isStop && wanted.view) view.mover.flyToAddress(wanted.view);
+  else if (wanted.view) view.mover.address = wanted.view;
   view.mover.walk(wanted.walk === "1");
   $("boxed").checked = wanted.boxes === "1";
   $("cameras").ariaPressed = String(wanted.cameras === "1");
@@ -422,7 +426,9 @@ async function apply(hash, turn = drop()) {
     list.fields = wanted;
     for (const prompt of found) if (prompt.named) keepWord(prompt);
     for (const prompt of found) if (taughtHere.has(prompt.text) && !prompt.inScene) attempt(() => teachScene(prompt));
-    if (wanted.photo && photos.named(wanted.photo)?.photo) photos.show(photos.named(wanted.photo));
+    const photo = photos.named(wanted.photo);
+    if (photo?.photo && isStop) photos.coming = photo;
+    else if (photo?.photo) photos.show(photo);
   } finally {
     if (turn === cleared) settle(hash);
   }
@@ -603,6 +609,7 @@ async function open() {
   list = new List(about, think, view, prompts);
   photos = new Photos(about, view, (name) => attempt(() => light(name === null ? chosenLook : name in about.looks ? name : chosenLook)));
   photos.changed = () => keepAddress();
+  tour = new Tour(() => shownNow([]), (hash) => attempt(() => apply(hash, drop(), true)), () => keepAddress());
   steps = new Steps((hash) => attempt(() => apply(hash)), () => {
     $("undo").disabled = !steps.past;
     $("redo").disabled = !steps.future;
@@ -655,6 +662,9 @@ window.lang3dxl = {
   clear,
   whatIs,
   prompts,
+  get tour() {
+    return tour;
+  },
   get view() {
     return view;
   },
