@@ -5,7 +5,7 @@ import { isQuestion } from "./grammar.js";
 import { Kept, readFields, Steps, written, MOST_PROMPTS } from "./history.js";
 import { unpacked } from "./library.js";
 import { List } from "./list.js";
-import { distanceAsText } from "./measure.js";
+import { distanceAsText, drawScale, setLength } from "./measure.js";
 import { Photos } from "./photos.js";
 import { areExamples, asPython, drawOutline, examplesAsText, examplesFromText, inside, rounded, UNNAMED, wordsFile } from "./teach.js";
 import { thinker } from "./think.js";
@@ -170,6 +170,7 @@ function draw(newest = null) {
 }
 
 function drawBoxes() {
+  drawScale(about, view);
   const boxes = $("boxed").checked ? prompts.filter((prompt) => prompt.box && !prompt.listed) : [];
   $("boxes").replaceChildren(...boxes.flatMap(outlineBox), ...list.outlines());
 }
@@ -247,7 +248,16 @@ async function measure(x, y) {
   const point = await think("point", { camera: view.picking, x, y });
   if (!point) return say("Nothing is there: click another place.");
   ends = ends.length === 1 ? [...ends, point] : [point];
+  $("known").hidden = ends.length === 1;
+  $("length").value = "";
   say(ends.length === 1 ? "Click the other end." : distanceAsText(ends, about));
+}
+
+/** Let the length between the two ends set the scale. */
+function typeLength() {
+  setLength(about, ends, Number($("length").value.replace(",", ".")));
+  say(distanceAsText(ends, about));
+  draw();
 }
 
 async function tell({ x, y, without }) {
@@ -387,7 +397,7 @@ const shownNow = (stops = tour.fields) =>
   written({
     stops,
     view: view.mover.address, walk: view.mover.walking ? 1 : "", not: $("not").value, hide: Number($("hide").value) || "", look: chosenLook,
-    boxes: $("boxed").checked ? 1 : "", cameras: $("cameras").ariaPressed === "true" ? 1 : "", photo: photos.shown?.name, ...list.fields,
+    unit: about.unit, boxes: $("boxed").checked ? 1 : "", cameras: $("cameras").ariaPressed === "true" ? 1 : "", photo: photos.shown?.name, ...list.fields,
     prompts: prompts.filter(({ examples }) => !examples || examples.length).map(asField),
   }); // prettier-ignore
 
@@ -407,6 +417,7 @@ async function apply(hash, turn = drop(), isStop = false) {
   else if (wanted.view) view.mover.address = wanted.view;
   view.mover.walk(wanted.walk === "1");
   $("boxed").checked = wanted.boxes === "1";
+  if (!isStop) about.unit = Number(wanted.unit) > 0 && Number.isFinite(Number(wanted.unit)) ? Number(wanted.unit) : null;
   $("cameras").ariaPressed = String(wanted.cameras === "1");
   $("hide").value = Number(wanted.hide) || 0;
   hideFloaters();
@@ -499,7 +510,8 @@ function listen() {
     photos.draw();
     keepAddress();
   });
-  on("measuring", "change", () => ((ends = []), $("measuring").checked ? say("Click one end of what you measure.") : quiet()));
+  on("length", "change", typeLength);
+  on("measuring", "change", () => ((ends = []), ($("known").hidden = true), $("measuring").checked ? say("Click one end of what you measure.") : quiet()));
   on("free", "change", () => (view.mover.free = $("free").checked));
   on("fold", "click", () => ($("fold").ariaExpanded = String(!document.body.classList.toggle("folded"))));
   on("full", "click", () => (document.fullscreenElement ? document.exitFullscreen() : document.documentElement.requestFullscreen()));

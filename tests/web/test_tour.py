@@ -10,7 +10,8 @@ from lang3dxl_ns.web.write_page import Page, write_page
 STOPS = [("the dome & its cross; “high”", "dome"), ("", "windows")]
 PLAYED = """async () => {
   const stops = [], seen = (caption) => {
-    const words = lang3dxl.prompts.map(({ text }) => text).join(), shown = caption.hidden ? "" : caption.textContent;
+    const words = lang3dxl.prompts.map(({ text }) => text).join();
+    const shown = caption.hidden ? "" : caption.textContent;
     if (stops.at(-1)?.[1] !== words) stops.push([shown, words, lang3dxl.view.mover.address]);
     else stops.at(-1)[2] = lang3dxl.view.mover.address;
   };
@@ -55,9 +56,10 @@ def test_kept_views_travel_in_the_link_and_play_in_order(browser, address):  # n
         until(page, "document.getElementById('play').textContent", "Play the tour")
 
 
-@pytest.mark.parametrize(
-    "hostile", ["stop=%00%ff", "stop=" + "x" * 5000, "stop=stop%3Dview&stop=caption%3D<b>", "stops=1"]
-)
+HOSTILE = ("stop=%00%ff", "stop=" + "x" * 5000, "stop=stop%3Dview&stop=caption%3D<b>", "stops=1&unit=-1")
+
+
+@pytest.mark.parametrize("hostile", HOSTILE, ids=range(4))
 def test_a_damaged_tour_opens_and_plays(browser, address, hostile):  # noqa: F811
     with visit(browser, f"{address}#{hostile}", DESK) as page:
         page.evaluate("lang3dxl.tour.play(1)")
