@@ -217,7 +217,7 @@ def _terminable() -> Iterator[None]:
 def _stop_again(ignored: Any) -> None:
     """Raise a KeyboardInterrupt once more that Python ignored, as it does in finalizers and C's callbacks."""
     if issubclass(ignored.exc_type, KeyboardInterrupt):
-        threading.Timer(0.05, signal.raise_signal, [signal.SIGINT]).start()
+        threading.Timer(0.05, signal.raise_signal, [signal.SIGTERM]).start()  # shells may ignore SIGINT
     else:
         sys.__unraisablehook__(ignored)
 

@@ -226,7 +226,7 @@ def _text_report(
 
 
 @showing(
-    *("scene", "text", "not_", "out", "web", "scene_file", "title", "credit", "license", "all"),
+    *("scene", "text", "not_", "out", "web", "scene_file", "title", "all"),
     *("look", "settings"),
 )
 @dataclass(kw_only=True)

@@ -18,6 +18,7 @@ from pytorch_msssim import SSIM
 from torch import Tensor, nn
 
 from lang3dxl_ns.common.console import say
+from lang3dxl_ns.common.device import to_device
 from lang3dxl_ns.components.downsampler import AttenuatedDownsampler, DownsamplerConfig
 from lang3dxl_ns.evaluation.scores import Maps
 
@@ -178,7 +179,7 @@ def feature_metrics(
     if not cells.any():
         return {}
     figures, wanted = {}, target[cells].double()
-    for whose, features in (("", predicted), ("_of_mean", mean.expand_as(target))):
+    for whose, features in (("", predicted), ("_of_mean", to_device(mean, target.device).expand_as(target))):
         found = features[cells].double()
         figures[f"{kind}_l1{whose}"] = float(F.l1_loss(found, wanted))
         figures[f"{kind}_psnr{whose}"] = float(psnr(found, wanted))

@@ -535,7 +535,7 @@ SPZ = struct.Struct("<IIIBBBB")
         ("a.ply", HEAD.format("quark").encode(), "column x has the type quark"),
         ("a.ply", HEAD.format("float").encode(), "no y, z, opacity"),
         ("a.ply", TEN.encode(), "has 10 columns f_rest, not 9, 24, 45 or 72"),
-        ("a.sog", b"PK", r"SuperSplat makes a \.ply of others"),
+        ("a.ksplat", b"PK", r"SuperSplat makes a \.ply of others"),
     ],
 )
 def test_a_refusal_names_version_degree_type_or_column(name, content, said, tmp_path):

@@ -98,6 +98,7 @@ def test_words_that_are_stopped_are_said_and_made_by_the_next_command(
         signal.raise_signal(signal.SIGINT)
 
     monkeypatch.setattr(fitting, "learn_words", stopped)
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # shells start background jobs without it
     with pytest.raises(KeyboardInterrupt):
         trained(data, tmp_path / "again", settings(4))
     assert "Stopped while words were learned; all iterations are kept" in capsys.readouterr().out
