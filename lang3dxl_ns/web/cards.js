@@ -19,7 +19,12 @@ export const explain = ({ count, detail, known, live, foreground }) =>
   `${(detail?.count ?? count).toLocaleString("en")} Gaussians. ` + (live ? "Ask for anything." : `Ask for any of ${known.toLocaleString("en")} words.`) +
   (foreground.length ? ` Matches lie on ${foreground.map(([text]) => shown(text)).join(" or ")}.` : "");
 
-export const matched = (count) => `${count.toLocaleString("en")} Gaussians match.`;
+/** Return how many Gaussians of the scene so many of chunk 0 stand for. about: the page's description. */
+export const wholeCount = (number, { count, detail }) => (detail ? Math.round((number * detail.count) / count) : number);
+
+/** Tell how many Gaussians match: nearly, where the scene has detail, which isn't counted. */
+export const matched = (number, { detail }) =>
+  detail ? `About ${number.toLocaleString("en", { maximumSignificantDigits: 2 })} Gaussians match.` : `${number.toLocaleString("en")} Gaussians match.`;
 
 function doubtIn({ text, examples, open, taught, trust }) {
   const count = examples && `${examples.length} example${examples.length > 1 ? "s" : ""}`;
@@ -31,8 +36,8 @@ function doubtIn({ text, examples, open, taught, trust }) {
 const sentence = (text) => `${text[0].toUpperCase()}${text.slice(1)}.`;
 
 /** Build a prompt's card. acts: { fly, remove, rename, dragThreshold, setThreshold, teach, outline, save, forget },
- * each called with the prompt. */
-export function promptCard(prompt, { fly, remove, rename, dragThreshold, setThreshold, teach, outline, save, forget }) {
+ * each called with the prompt; about: the page's description. */
+export function promptCard(prompt, { fly, remove, rename, dragThreshold, setThreshold, teach, outline, save, forget }, about) {
   const { text, negatives, color, threshold, peak, matching, views, examples, open } = prompt;
   const card = element("li");
   card.style.setProperty("--color", `rgb(${color})`);
@@ -57,7 +62,7 @@ export function promptCard(prompt, { fly, remove, rename, dragThreshold, setThre
   const ends = [threshold, peak].map((value) => element("span", {}, value.toFixed(2)));
   if (peak > threshold) card.append(element("div", { className: "ends" }, ends[0], element("div", { className: "heat" }), ends[1]));
   card.append(
-    element("p", {}, `${doubtIn(prompt)} `, element("span", { className: "count" }, matched(matching))),
+    element("p", {}, `${doubtIn(prompt)} `, element("span", { className: "count" }, matched(matching, about))),
     element("label", {}, "Threshold", slider)); // prettier-ignore
   return card;
 }

@@ -4,11 +4,12 @@
 const MOST_KEPT = 20, MOST_TEXT = 2000;
 export const MOST_PROMPTS = 20;
 
-/** Write what is shown as fields of an address, in order: { view, walk, … } and prompts, each of them with the
- * fields `at` (a threshold that was chosen) and `hue` (its color, where that is not the next one). */
-export function written({ prompts, ...others }) {
+/** Write what is shown as fields of an address, in order: { view, walk, … }, stops of a tour, and prompts, each of them with
+ * the fields `at` (a threshold that was chosen) and `hue` (its color, where that is not the next one). */
+export function written({ prompts, stops = [], ...others }) {
   const fields = new URLSearchParams();
   for (const [name, value] of Object.entries(others)) if (value) fields.set(name, value);
+  for (const stop of stops) fields.append("stop", stop);
   prompts.forEach(({ kind, text, at, hue }, k) => {
     fields.append(kind, text);
     if (at !== undefined) fields.append("at", +at.toFixed(3));
@@ -19,14 +20,15 @@ export function written({ prompts, ...others }) {
 
 /** Read an address: the opposite of `written`. What is damaged or unknown is left out. */
 export function readFields(hash) {
-  const shown = { prompts: [] };
+  const shown = { prompts: [], stops: [] };
   let latest = null;
   for (const [name, value] of new URLSearchParams(hash.slice(1))) {
     const number = value === "" ? NaN : Number(value);
     if (name === "ask" || name === "like") shown.prompts.push((latest = { kind: name, text: name === "ask" ? value.slice(0, MOST_TEXT) : value, hue: shown.prompts.length }));
     else if (name === "at" && latest && number >= 0 && number <= 1) latest.at = number;
     else if (name === "hue" && latest && Number.isInteger(number) && number >= 0) latest.hue = number;
-    else if (name !== "at" && name !== "hue" && name !== "prompts") shown[name] = value;
+    else if (name === "stop") shown.stops.push(value);
+    else if (name !== "at" && name !== "hue" && name !== "prompts" && name !== "stops") shown[name] = value;
   }
   shown.prompts.splice(MOST_PROMPTS);
   return shown;

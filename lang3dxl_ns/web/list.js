@@ -2,6 +2,7 @@
 import { element, shown } from "./cards.js";
 import { answerTo, parse, wordsOf } from "./grammar.js";
 import { Vector3 } from "./library.js";
+import { lengthAsText } from "./measure.js";
 
 const NAMESPACE = "http://www.w3.org/2000/svg", CORNERS = [0, 1, 2, 3, 4, 5, 6, 7];
 const FILLED = 0.35, NARROW = 15, WIDE = 60; // share of the window that a thing fills after a flight; degrees of the lens
@@ -40,7 +41,7 @@ export class List extends EventTarget {
   part(prompt) {
     if (!prompt.found) return null;
     const { things } = prompt.found, small = (label, act, more) => element("button", { className: "small", onclick: act, ...more }, label);
-    const summary = element("summary", {}, things.length ? `${count(prompt.found)} found` : "No single things found");
+    const summary = element("summary", {}, things.length ? `${count(prompt.found)} found${this.about.detail ? " in the coarse scene" : ""}` : "No single things found");
     const made = element("details", { className: "things", open: Boolean(prompt.listed) }, summary);
     summary.addEventListener("click", (event) => {
       event.preventDefault();
@@ -54,7 +55,8 @@ export class List extends EventTarget {
       const ask = { ariaLabel: `${shown(prompt.text)} ${k + 1}`, ariaPressed: String(own && this.chosen.thing === thing) };
       listed.append(element("li", { className: prompt.asked?.has(thing.id) ? "asked" : "" }, small(`${k + 1}`, () => this.choose(prompt, thing), ask)));
     });
-    made.append(element("div", {}, small("‹", () => this.step(-1, prompt), { ariaLabel: "Previous thing" }), small("›", () => this.step(1, prompt), { ariaLabel: "Next thing" }),
+    const [wide, deep, high] = own ? this.chosen.thing.size.map((side) => lengthAsText(side, this.about)) : [];
+    made.append(element("p", { className: "size" }, own ? `${high} high, ${wide} × ${deep} on the ground.` : ""), element("div", {}, small("‹", () => this.step(-1, prompt), { ariaLabel: "Previous thing" }), small("›", () => this.step(1, prompt), { ariaLabel: "Next thing" }),
       small("Hide the rest", () => this.hideRest(!this.alone), { ariaPressed: String(own && this.alone), disabled: !own })), listed); // prettier-ignore
     return made;
   }

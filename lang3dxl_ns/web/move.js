@@ -7,6 +7,14 @@ const LOOK = 0.003, WHEEL = 0.001, STEEPEST = 1.5; // radians per pixel, seconds
 const WAYS = { w: [0, 0, 1], s: [0, 0, -1], a: [-1, 0, 0], d: [1, 0, 0], q: [0, -1, 0], e: [0, 1, 0] }; // right, up, ahead
 export const still = matchMedia("(prefers-reduced-motion: reduce)");
 
+/** Read a viewpoint's text, the opposite of `Mover.address`; null if it is none. */
+function standOf(text) {
+  const numbers = text.split(",").map(Number);
+  if (numbers.length !== 7 || !numbers.every(Number.isFinite) || !(numbers[6] > 1 && numbers[6] < 170)) return null;
+  const [position, target] = [0, 3].map((k) => new Vector3(...numbers.slice(k, k + 3)));
+  return position.distanceTo(target) > 0 ? { position, target, fov: numbers[6] } : null;
+}
+
 export class Mover extends EventTarget {
   /** Steer a camera. about: the page's description; canvas, frame: what is dragged, and what takes keys. wake: asks
    * for a new frame. Fires `walks` when the way of moving changes, `blocked` where the eye may not go, and `far`
@@ -52,10 +60,8 @@ export class Mover extends EventTarget {
   }
 
   set address(text) {
-    const numbers = text.split(",").map(Number);
-    if (numbers.length !== 7 || !numbers.every(Number.isFinite) || !(numbers[6] > 1 && numbers[6] < 170)) return;
-    const [position, target] = [0, 3].map((k) => new Vector3(...numbers.slice(k, k + 3)));
-    if (position.distanceTo(target) > 0) this.jump({ position, target, fov: numbers[6] });
+    const stand = standOf(text);
+    if (stand) this.jump(stand);
   }
 
   /** Stand somewhere at once, without a flight. */
@@ -110,6 +116,12 @@ export class Mover extends EventTarget {
   /** Fly to a photo's viewpoint, around the target rather than through it. */
   flyTo(photo, target) {
     this.fly(this.standing(photo, target));
+  }
+
+  /** Fly to a viewpoint that is written as `address` is. */
+  flyToAddress(text) {
+    const stand = standOf(text);
+    if (stand) this.fly(stand);
   }
 
   overview() {

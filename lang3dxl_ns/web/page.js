@@ -1,21 +1,22 @@
 // The page: the search box and its prompts, answers to clicks, words that are taught, and the keys.
-import { element, explain, matched, percent, promptCard, say, shown } from "./cards.js";
+import { element, explain, matched, percent, promptCard, say, shown, wholeCount } from "./cards.js";
 import { Detail } from "./detail.js";
 import { isQuestion } from "./grammar.js";
 import { Kept, readFields, Steps, written, MOST_PROMPTS } from "./history.js";
 import { unpacked } from "./library.js";
 import { List } from "./list.js";
-import { distanceAsText } from "./measure.js";
+import { distanceAsText, drawScale, setLength } from "./measure.js";
 import { Photos } from "./photos.js";
 import { areExamples, asPython, drawOutline, examplesAsText, examplesFromText, inside, rounded, UNNAMED, wordsFile } from "./teach.js";
 import { thinker } from "./think.js";
+import { Tour } from "./tour.js";
 import { parsePrompts, tidy } from "./vocabulary.js";
 import { View } from "./view.js";
 
 const TYPING = 500, MOST_TRIED = 6, TIE = 0.02; // milliseconds until negatives take effect; suggested words; relevancies that tell words apart
 const $ = (id) => document.getElementById(id);
 const prompts = [], taughtHere = new Set(); // names that were taught to the server's scene from here
-let about, view, photos, list, steps, kept, latest = null, settled = false, cleared = 0; // settled: the address has been read; cleared: how often all prompts were removed
+let about, view, photos, list, tour, steps, kept, latest = null, settled = false, cleared = 0; // settled: the address has been read; cleared: how often all prompts were removed
 let ends = [], outlining = null, chosenLook = "";
 
 const think = thinker(
@@ -38,7 +39,7 @@ async function answer(prompt) {
   if (prompt.examples && !prompt.examples.length) return Object.assign(prompt, { known: true, relevancy: null, threshold: null });
   const found = await think("ask", { ...question(prompt), threshold: prompt.chosen });
   if (turn !== prompt.turn || !found.known) return found;
-  return Object.assign(prompt, found, { views: null, box: null, finding: null });
+  return Object.assign(prompt, found, { matching: wholeCount(found.matching, about), views: null, box: null, finding: null });
 }
 
 /** Answer all prompts anew, once the common negatives have changed. */
@@ -156,7 +157,7 @@ function draw(newest = null) {
   list.tidy();
   const [from, label] = [prompts.find(({ card }) => card?.contains(focused)), focused?.ariaLabel ?? focused?.textContent];
   for (const prompt of prompts) {
-    prompt.card = promptCard(prompt, acts);
+    prompt.card = promptCard(prompt, acts, about);
     prompt.card.append(list.part(prompt) ?? "");
   }
   $("prompts").replaceChildren(...prompts.map(({ card }) => card));
@@ -169,6 +170,7 @@ function draw(newest = null) {
 }
 
 function drawBoxes() {
+  drawScale(about, view);
   const boxes = $("boxed").checked ? prompts.filter((prompt) => prompt.box && !prompt.listed) : [];
   $("boxes").replaceChildren(...boxes.flatMap(outlineBox), ...list.outlines());
 }
@@ -218,8 +220,9 @@ function rename(prompt, name) {
 function dragThreshold(prompt, value) {
   let count = 0;
   for (const relevancy of prompt.relevancy) count += relevancy > value;
-  Object.assign(prompt, { chosen: value, threshold: value, matching: count, dragged: true });
-  prompt.card.querySelector(".count").textContent = matched(count);
+  const matching = wholeCount(count, about);
+  Object.assign(prompt, { chosen: value, threshold: value, matching, dragged: true });
+  prompt.card.querySelector(".count").textContent = matched(matching, about);
   const end = prompt.card.querySelector(".ends span");
   if (end) end.textContent = value.toFixed(2);
   view.recolor(prompts.filter((one) => one.relevancy));
@@ -245,7 +248,16 @@ async function measure(x, y) {
   const point = await think("point", { camera: view.picking, x, y });
   if (!point) return say("Nothing is there: click another place.");
   ends = ends.length === 1 ? [...ends, point] : [point];
+  $("known").hidden = ends.length === 1;
+  $("length").value = "";
   say(ends.length === 1 ? "Click the other end." : distanceAsText(ends, about));
+}
+
+/** Let the length between the two ends set the scale. */
+function typeLength() {
+  setLength(about, ends, Number($("length").value.replace(",", ".")));
+  say(distanceAsText(ends, about));
+  draw();
 }
 
 async function tell({ x, y, without }) {
@@ -380,11 +392,12 @@ function asField(prompt) {
   return { kind: examples ? "like" : "ask", text: examples ? examplesAsText(prompt.text, examples) : asTyped(prompt), at: chosen, hue: about.colors.indexOf(color) };
 }
 
-/** What is shown, as an address. */
-const shownNow = () =>
+/** What is shown, as an address. stops: of the tour. */
+const shownNow = (stops = tour.fields) =>
   written({
+    stops,
     view: view.mover.address, walk: view.mover.walking ? 1 : "", not: $("not").value, hide: Number($("hide").value) || "", look: chosenLook,
-    boxes: $("boxed").checked ? 1 : "", cameras: $("cameras").ariaPressed === "true" ? 1 : "", photo: photos.shown?.name, ...list.fields,
+    unit: about.unit, boxes: $("boxed").checked ? 1 : "", cameras: $("cameras").ariaPressed === "true" ? 1 : "", photo: photos.shown?.name, ...list.fields,
     prompts: prompts.filter(({ examples }) => !examples || examples.length).map(asField),
   }); // prettier-ignore
 
@@ -393,15 +406,18 @@ function keepAddress(own = false) {
   if (settled) steps.keep(shownNow(), own);
 }
 
-/** Show what an address says. Prompts that are shown already stay as they are. */
-async function apply(hash, turn = drop()) {
+/** Show what an address says, after a flight if it is a stop of the tour. Prompts that are shown already stay as they are. */
+async function apply(hash, turn = drop(), isStop = false) {
   const wanted = readFields(hash), found = [], open = prompts.find((prompt) => prompt.open)?.text;
   settled = false;
   outlining?.abort();
   photos.hide();
-  if (wanted.view) view.mover.address = wanted.view;
+  if (!isStop) Object.assign(tour, { fields: wanted.stops }).stop();
+  if (isStop && wanted.view) view.mover.flyToAddress(wanted.view);
+  else if (wanted.view) view.mover.address = wanted.view;
   view.mover.walk(wanted.walk === "1");
   $("boxed").checked = wanted.boxes === "1";
+  if (!isStop) about.unit = Number(wanted.unit) > 0 && Number.isFinite(Number(wanted.unit)) ? Number(wanted.unit) : null;
   $("cameras").ariaPressed = String(wanted.cameras === "1");
   $("hide").value = Number(wanted.hide) || 0;
   hideFloaters();
@@ -421,7 +437,9 @@ async function apply(hash, turn = drop()) {
     list.fields = wanted;
     for (const prompt of found) if (prompt.named) keepWord(prompt);
     for (const prompt of found) if (taughtHere.has(prompt.text) && !prompt.inScene) attempt(() => teachScene(prompt));
-    if (wanted.photo && photos.named(wanted.photo)?.photo) photos.show(photos.named(wanted.photo));
+    const photo = photos.named(wanted.photo);
+    if (photo?.photo && isStop) photos.coming = photo;
+    else if (photo?.photo) photos.show(photo);
   } finally {
     if (turn === cleared) settle(hash);
   }
@@ -492,7 +510,8 @@ function listen() {
     photos.draw();
     keepAddress();
   });
-  on("measuring", "change", () => ((ends = []), $("measuring").checked ? say("Click one end of what you measure.") : quiet()));
+  on("length", "change", typeLength);
+  on("measuring", "change", () => ((ends = []), ($("known").hidden = true), $("measuring").checked ? say("Click one end of what you measure.") : quiet()));
   on("free", "change", () => (view.mover.free = $("free").checked));
   on("fold", "click", () => ($("fold").ariaExpanded = String(!document.body.classList.toggle("folded"))));
   on("full", "click", () => (document.fullscreenElement ? document.exitFullscreen() : document.documentElement.requestFullscreen()));
@@ -602,6 +621,7 @@ async function open() {
   list = new List(about, think, view, prompts);
   photos = new Photos(about, view, (name) => attempt(() => light(name === null ? chosenLook : name in about.looks ? name : chosenLook)));
   photos.changed = () => keepAddress();
+  tour = new Tour(() => shownNow([]), (hash) => attempt(() => apply(hash, drop(), true)), () => keepAddress());
   steps = new Steps((hash) => attempt(() => apply(hash)), () => {
     $("undo").disabled = !steps.past;
     $("redo").disabled = !steps.future;
@@ -654,6 +674,9 @@ window.lang3dxl = {
   clear,
   whatIs,
   prompts,
+  get tour() {
+    return tour;
+  },
   get view() {
     return view;
   },

@@ -5,7 +5,7 @@ import { Scene, SparkRenderer, Vector3, WebGLRenderer } from "./library.js";
 import { FAN } from "./tree.js";
 
 const BLUR = 0.3; // square pixels
-const FLUENT = 40, COARSEST = 0.3, STILL = 150; // milliseconds of a frame, least share of pixels a side, milliseconds
+const FLUENT = 40, COARSEST = 0.3, STILL = 150, REST = 2; // milliseconds of a frame, least share of pixels a side, milliseconds; times of a sharp picture until the next one
 
 export class View extends EventTarget {
   /** Fill an element. about: the page's description; frame: the element. Fires `moved`, `drawn`, `click` and
@@ -14,7 +14,7 @@ export class View extends EventTarget {
     super();
     Object.assign(this, { about, frame, parts: new Map(), heat: () => undefined }); // parts: by number, chunk 0 first; heat: see Part.paint
     this.renderer = new WebGLRenderer({ antialias: false });
-    Object.assign(this, { cost: 4 * FLUENT, sharp: false, changed: false, asked: false, drawing: null, order: "" });
+    Object.assign(this, { cost: 4 * FLUENT, sharp: false, changed: false, unsorted: false, ended: 0, asked: false, drawing: null, order: "" });
     const [red, green, blue] = about.background.map((value) => Math.round(255 * value));
     this.renderer.setClearColor(`rgb(${red}, ${green}, ${blue})`);
     this.canvas = frame.appendChild(this.renderer.domElement);
@@ -63,6 +63,7 @@ export class View extends EventTarget {
   }
 
   cover(number, covered) {
+    this.unsorted = true;
     const parent = Math.floor((number - 1) / FAN);
     this.parts.get(parent).covered[(number - 1) % FAN] = covered;
     this.repaint(parent);
@@ -82,12 +83,13 @@ export class View extends EventTarget {
     if (!this.root || (told.length === this.layers?.length && told.every((value, k) => value === this.layers[k]))) return;
     Object.assign(this, { layers: told, shown: layers });
     for (const number of this.parts.keys()) this.repaint(number);
+    this.wake();
     this.dispatchEvent(new Event("heated"));
   }
 
   repaint(number) {
     this.parts.get(number)?.paint(this.shown ?? [], this.heat, this.limit, this.only);
-    this.wake();
+    this.refresh();
   }
 
   /** Hide the Gaussians that float more than a limit, 0…255. */
@@ -110,6 +112,13 @@ export class View extends EventTarget {
     this.request();
   }
 
+  /** Redraw what has changed before an eye that rests: the picture stays sharp, however long detail arrives. */
+  refresh() {
+    this.sharp = false;
+    if (this.held || this.mover.flight || this.mover.striding) this.changed = true;
+    this.request();
+  }
+
   request() {
     if (!this.asked) requestAnimationFrame((now) => this.step(now));
     this.asked = true;
@@ -128,7 +137,7 @@ export class View extends EventTarget {
     if (this.changed) {
       this.draw(Math.max(Math.min(Math.sqrt(FLUENT / this.cost), 1), COARSEST));
       this.dispatchEvent(new Event("moved"));
-    } else if (!this.sharp && !this.held && now - this.moved > Math.max(STILL, this.cost / 4)) this.draw(1);
+    } else if (!this.sharp && !this.held && now - this.moved > Math.max(STILL, this.cost / 4) && now - this.ended > REST * this.cost) this.draw(1);
     if (!this.resting) this.request();
   }
 
@@ -146,7 +155,7 @@ export class View extends EventTarget {
     this.drawing = null;
     this.dispatchEvent(new Event("drawn"));
     if (share === 1 || !this.measured) this.cost = Math.min((performance.now() - start) / share ** 2, 2000);
-    this.measured ||= share === 1;
+    if (share === 1) Object.assign(this, { measured: true, ended: performance.now() });
     this.controls.enableDamping = !still.matches && this.cost < 2 * FLUENT; // damping takes a hundred frames
     return true;
   }
@@ -156,6 +165,7 @@ export class View extends EventTarget {
     if (this.lost) return;
     const gl = this.renderer.getContext(), ratio = share * Math.min(devicePixelRatio, 2), start = performance.now();
     if (this.renderer.getPixelRatio() !== ratio) this.renderer.setPixelRatio(ratio);
+    if (!this.spark.sorting) this.unsorted = false; // Spark takes no new chunks while it sorts
     this.renderer.render(this.scene, this.camera);
     this.drawing = { fence: gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0), start, share };
     gl.flush();
@@ -164,10 +174,10 @@ export class View extends EventTarget {
 
   /** Draw the splats after sorting, if their order has changed. */
   sorted() {
-    const { sortedCenter, sortedDir, sorting } = this.spark, order = [...sortedCenter, ...sortedDir].join();
-    if (sorting || order === this.order) return;
+    const { sortedCenter, sortedDir, sorting, display } = this.spark, order = [...sortedCenter, ...sortedDir, display.mappingVersion].join();
+    if (sorting || (order === this.order && !this.unsorted)) return;
     this.order = order;
-    this.wake();
+    this.refresh();
   }
 
   resize() {

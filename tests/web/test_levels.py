@@ -136,6 +136,32 @@ def test_a_page_of_chunks_ends_with_the_picture_and_the_heat_of_the_whole(browse
     assert all(abs(words[0][word] - words[1][word]) < 0.02 for word in words[0])
 
 
+ARRIVING = """async () => {
+  const { view } = lang3dxl;
+  view.wake();
+  for (let k = 0; k < 400; k++) {
+    view.repaint(0); // as arriving detail does
+    await new Promise((go) => setTimeout(go, 30));
+    if (view.sharp) return true;
+  }
+  return false;
+}"""
+
+
+def test_the_picture_is_sharp_while_detail_arrives_and_numbers_are_of_the_whole(browser, tmp_path):  # noqa: F811
+    scene = rough_wall()
+    write_page(Page(scene, large=MOST), tmp_path)
+    with served(tmp_path) as address:
+        tab = opened(browser, address, DESK)
+        found = tab.evaluate("lang3dxl.ready.then(() => lang3dxl.ask('dome'))")
+        card = tab.evaluate("lang3dxl.prompts[0].card.querySelector('.count').textContent")
+        tab.evaluate(HELD)
+        assert tab.evaluate(ARRIVING)
+        tab.close()
+    exact = int(scene.ask("dome").gaussians[0].sum())
+    assert abs(found["matching"] / exact - 1) < 0.2 and card.startswith("About ")
+
+
 def test_a_lighting_reaches_the_details(browser, tmp_path):  # noqa: F811
     page = Page(painted_scene(looks=painted_looks()), large=MOST)
     write_page(page, tmp_path)

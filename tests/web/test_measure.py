@@ -3,6 +3,7 @@
 import re
 from dataclasses import replace
 
+import numpy as np
 from painted_scene import painted_file, painted_scene
 from test_web_page import DESK, browser, opened, served  # noqa: F401
 
@@ -31,3 +32,64 @@ def test_two_clicks_tell_a_distance_in_meters_and_its_height(browser, tmp_path):
         scale = 20 if known else 1
         assert abs(apart - 1.5 * scale) < 0.15 * scale and abs(rise - 0.9 * scale) < 0.15 * scale
         assert ("± 3 %" in told) == (known is not None) == ("units" not in told)
+
+
+SCALE = """() => {
+  const { camera, controls } = lang3dxl.view, bar = document.getElementById("bar");
+  const across = camera.position.clone().setFromMatrixColumn(camera.matrixWorld, 0);
+  const place = (unit) => controls.target.clone().addScaledVector(across, unit).toArray();
+  const pixels = (unit) => lang3dxl.view.pixel(place(unit))[0];
+  const { width } = bar.getBoundingClientRect(), angle = document.getElementById("north").style.transform;
+  const { hidden } = document.getElementById("scale"), unit = pixels(1) - pixels(0);
+  return { hidden, told: bar.textContent, width, unit,
+    arrow: document.getElementById("north").hidden ? null : parseFloat(angle.slice(7)) };
+}"""
+
+FRAMES = """async () => {
+  for (let k = 0; k < 100; k++) {
+    await new Promise((go) => setTimeout(go, 50));
+    if (lang3dxl.view.resting) return;
+  }
+}"""
+
+
+def test_a_typed_length_sets_the_scale_and_travels_in_the_link(browser, tmp_path):  # noqa: F811
+    write_page(Page(painted_scene()), tmp_path)
+    with served(tmp_path) as address:
+        tab = opened(browser, address, DESK)
+        assert tab.evaluate(SCALE)["hidden"]
+        tab.evaluate("document.getElementById('more').open = true")
+        tab.evaluate("document.getElementById('measuring').click()")
+        tab.evaluate(CLICK, [-0.6, -0.4])
+        units = float(tab.evaluate(CLICK, [0.6, 0.5]).split()[0])
+        tab.fill("#length", "30,0")
+        tab.press("#length", "Enter")
+        assert tab.evaluate("document.getElementById('status').textContent").startswith("30 m apart")
+        link = tab.evaluate("location.href")
+        tab.close()
+        tab = opened(browser, link, DESK)
+        found = tab.evaluate(SCALE)
+        tab.close()
+    meters = float(found["told"].removesuffix(" m"))
+    assert found["arrow"] is None and 40 < found["width"] <= 121
+    assert abs(found["width"] / found["unit"] * 30 / units / meters - 1) < 0.02
+
+
+def test_the_arrow_points_north(browser, tmp_path):  # noqa: F811
+    meters = Georeference(20.0, (0.0, -1.0, 0.0), (1.0, 0.0, 0.0), 0.03, 5)
+    write_page(Page(painted_scene(file=replace(painted_file(), georeference=meters))), tmp_path)
+    angles = []
+    with served(tmp_path) as address:
+        tab = opened(browser, address, DESK)
+        for eye in (
+            "-4,0,0",
+            "4,1,0",
+            "0,-1,4",
+            "0,0,-4",
+        ):  # looking north, south, east, west
+            tab.evaluate(f"lang3dxl.view.mover.address = '{eye},0,0,0,60'")
+            tab.evaluate(FRAMES)
+            angles.append(tab.evaluate(SCALE)["arrow"])
+        tab.close()
+    turns = np.exp(1j * np.array(angles))
+    np.testing.assert_allclose(turns, [1, -1, -1j, 1j], atol=1e-3)
