@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 @dataclass(kw_only=True)
 class ListThings:
     """List the single things that words name: windows, portals, towers. --out gets things.json (boxes,
-    scores, photos, what is in what), things.csv, instances.json (COCO boxes in all photos) and things.png
+    scores, photos, relations), things.csv, instances.json (COCO boxes in all photos) and things.png
     (numbered boxes)."""
 
     scene: tyro.conf.Positional[Path | None] = None

@@ -16,8 +16,10 @@ LEAST = 6
 """Pixels below which a region is noise."""
 PART = 0.25
 """Share of a region that each of its parts must hold for the region to be split."""
-DEPTH = 0.05
-"""Relative distance from the visible surface within which a Gaussian belongs to a pixel."""
+DEPTH = 0.03
+"""Relative distance from the depth of what matches within which a Gaussian belongs to a pixel."""
+FILLED = 0.5
+"""Pixels that a Gaussian must fill in a view to belong to a piece of it: fainter ones are seen through."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,9 +48,9 @@ class Shown:
     heat: Float[Array, "h w"]
     """Heat map, 0…1."""
     depth: Float[Array, "h w"]
-    """Depth of the visible surface, world units."""
+    """Mean depth of what matches in each pixel, world units: panes lie behind the wall in front of them."""
     rows: Int[Array, " m"]
-    """Indices of the Gaussians that the view shows."""
+    """Indices of the Gaussians that fill enough of the view."""
     points: Float[Array, "m 3"]
     """Column and row of these Gaussians' centers in pixels, and their depth."""
     focal: float

@@ -1,5 +1,7 @@
 """Laws of things: pieces, joining, boxes and questions, on scenes that are drawn by hand."""
 
+import json
+
 import numpy as np
 import pytest
 from painted_scene import painted_scene
@@ -9,9 +11,11 @@ from lab.landmark.landmark import Landmark
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.things.find import Things, things_of
 from lang3dxl_ns.things.grammar import Request, Sight, answer, parse, table
-from lang3dxl_ns.things.join import join, without_crumbs
+from lang3dxl_ns.things.join import OFTEN, join, without_crumbs
 from lang3dxl_ns.things.pieces import Piece, Shown, pieces_of, split
+from lang3dxl_ns.things.sight import sight_of
 from lang3dxl_ns.things.thing import Thing, upright_box
+from lang3dxl_ns.things.write import write_catalog
 
 SIGHT = Sight(np.array([1.0, 0, 0]), np.array([0, 0, 1.0]), np.array([0, 1.0, 0]))
 
@@ -68,6 +72,15 @@ def test_crumbs_go_and_equals_stay():
     found = without_crumbs(join([piece("a", rows, 1.0) for rows in sizes], np.ones(202)))
     assert [len(one.rows) for one in found] == [100, 100]
     assert without_crumbs([]) == []
+
+
+def test_many_views_tell_that_a_small_thing_is_no_crumb():
+    sizes = [np.arange(100), np.arange(100, 102), np.arange(102, 104)]
+    shown = [piece(str(v), rows, 1.0) for rows, n in zip(sizes, (2, OFTEN, OFTEN - 1), strict=True)
+             for v in range(n)]  # fmt: skip
+    found = without_crumbs(join(shown, np.ones(104)))
+    assert [len(one.rows) for one in found] == [100, 2]
+    assert 100 in found[1].rows
 
 
 def test_a_box_turns_with_its_points():
@@ -159,3 +172,18 @@ def test_a_thing_keeps_its_id_in_later_questions_and_under_other_words():
     assert {one.id for one in first.things} == {one.id for one in again.things}
     (alone,) = things_of(painted_scene(), "window")
     assert {one.id for one in alone.things} == {one.id for one in first.things}
+
+
+def test_the_catalog_names_the_nearest_neighbors_and_what_is_in_what(tmp_path):
+    scene = painted_scene()
+    row = [thing(i, "window", (x, 0, 5)) for i, x in enumerate([0, 3, 9])]
+    everywhere = thing(9, "wall", (4, 0, 5), (20, 1, 10))
+    view = sight_of(scene, row)
+    write_catalog(scene, [Things("window", row, 3, 3), Things("wall", [everywhere], 1, 1)], tmp_path)
+    graph = json.loads((tmp_path / "things.json").read_text())["relations"]
+    assert [[a, b] for a, name, b in graph if name == "in"] == [[0, 9], [1, 9], [2, 9]]
+    side, other = ("left_of", "right_of") if view.right[0] > 0 else ("right_of", "left_of")
+    assert [0, side, 1] in graph
+    assert [1, other, 0] in graph
+    assert [0, side, 2] not in graph  # the one between is nearer
+    assert [1, side, 2] in graph
