@@ -47,9 +47,11 @@ def test_a_region_splits_where_it_falls_apart_and_only_there():
 def test_hidden_gaussians_belong_to_no_piece():
     heat, depth = bumps(20), np.full((20, 60), 5.0)
     points = np.array([[20, 10, 5.0], [20, 10, 9.0], [50, 10, 5.0]])
-    (found,) = pieces_of(Shown("a", heat, depth, np.array([7, 8, 9]), points, 100.0))
+    (found,) = pieces_of(Shown("a", heat, depth, depth, np.array([7, 8, 9]), points, 100.0))
     assert found.rows.tolist() == [7]
     assert found.resolution == pytest.approx(20)
+    (deep,) = pieces_of(Shown("a", heat, depth, depth + 4, np.array([7, 8, 9]), points, 100.0))
+    assert deep.rows.tolist() == [7, 8]  # a pane behind the wall's edge
 
 
 def test_a_coarse_view_does_not_join_what_a_fine_one_tells_apart():
