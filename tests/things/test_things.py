@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 from painted_scene import painted_scene
 
+from lab.benchmarks.questions import Known, ask_all
 from lab.landmark.instances import true_things
 from lab.landmark.landmark import Landmark
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.things.find import Things, things_of
-from lang3dxl_ns.things.grammar import Request, Sight, answer, parse, table
+from lang3dxl_ns.things.grammar import Request, Sight, answer, parse, table, unsure
 from lang3dxl_ns.things.join import OFTEN, join, without_crumbs
 from lang3dxl_ns.things.pieces import Piece, Shown, pieces_of, split
 from lang3dxl_ns.things.sight import sight_of
@@ -189,3 +190,35 @@ def test_the_catalog_names_the_nearest_neighbors_and_what_is_in_what(tmp_path):
     assert [1, other, 0] in graph
     assert [0, side, 2] not in graph  # the one between is nearer
     assert [1, side, 2] in graph
+
+
+def test_generated_questions_are_right_where_all_is_found_and_tell_what_is_missed():
+    scene = painted_scene()
+    rng = np.random.default_rng(0)
+    true = [thing(i, "window", rng.uniform(0, 9, 3), rng.uniform(0.5, 2, 3)) for i in range(5)]
+    true += [thing(9, "portal", (4.5, 0, 0), (2, 1, 4))]
+
+    def outcomes(missed: int, least: int = 5):
+        known = {}
+        for word in ("window", "portal"):
+            own = [one for one in true if one.word == word]
+            found = [one for one in own if one.id != missed]
+            sure = len(found) if word == "portal" else least
+            known[word] = Known(Things(word, found, sure, len(found)), own, {one: one for one in found})
+        return ask_all(scene, known)
+
+    every = outcomes(missed=-1)
+    assert len(every) > 50
+    assert all(one.right and one.right_if_found for one in every)
+    assert not any(one.cautious for one in every if not one.question.startswith("how many"))
+    some = outcomes(missed=2, least=3)
+    assert all(one.right_if_found for one in some)
+    assert 0 < sum(one.right for one in some) < len(some)
+    assert all(one.cautious for one in some if not one.right and "portal from" not in one.question
+               and not one.question.startswith("how many"))  # fmt: skip
+
+
+def test_an_answer_tells_which_numbers_are_unsure():
+    found = [Things("window", [thing(1, "window", (0, 0, 0))], 1, 1), Things("portal", [], 0, 4)]
+    assert unsure(parse("highest window"), found) is None
+    assert unsure(parse("window above the portal"), found) == "portal: 0, perhaps 0 to 4"
