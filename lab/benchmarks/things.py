@@ -12,6 +12,7 @@ from jaxtyping import Float
 from numpy import ndarray as Array
 from scipy.optimize import linear_sum_assignment
 
+from lab.benchmarks.questions import Known, Outcome, ask_all, in_words
 from lab.landmark.instances import TrueThing, placed, seen_things
 from lab.landmark.labels import CATEGORIES
 from lab.reports import command_line
@@ -29,7 +30,7 @@ _SAMPLES = 20
 
 @dataclass
 class ThingsBenchmark:
-    """Score the things of trained demo scenes: F1, counts, 3-D IoU of boxes, time."""
+    """Score the things of trained demo scenes: F1, counts, 3-D IoU of boxes, time, and 200 questions."""
 
     scene: tuple[Path, ...]
     """Scene files or runs of demo scenes, as `lang3dxl query` takes them."""
@@ -44,6 +45,7 @@ class ThingsBenchmark:
         if len(self.scene) != len(self.data):
             raise UserError("give as many --data folders as scenes")
         rows: list[Score] = []
+        asked: list[Outcome] = []
         seconds: dict[str, float] = {}
         for path, data in zip(self.scene, self.data, strict=True):
             scene, truth = load_scene(path), true_things_of(load_scene(path), data)
@@ -52,6 +54,7 @@ class ThingsBenchmark:
             answers = things_of(scene, list(CATEGORIES))
             seconds[data.parent.name] = time.process_time() - start
             rows += [score(answer, truth, data.parent.name) for answer in answers]
+            asked += ask_all(scene, {one.word: known(one, truth) for one in answers})
         table = markdown_table(
             ["word", "seen", "found", "false", "F1", "count off (median)", "in range", "box IoU"],
             [_summary(word, [row for row in rows if row.word == word]) for word in CATEGORIES],
@@ -59,8 +62,14 @@ class ThingsBenchmark:
         times = ", ".join(f"{name} {t:.1f}" for name, t in seconds.items())
         command = command_line("lang3dxl benchmark things", self)
         text = f"# Things\n\n    {command}\n\n{table}\n\nProcessor seconds per catalog: {times}\n"
+        text += f"\n{in_words(asked)}\n"
         each = [vars(row) for row in rows]
-        write_report(self.out, "things", text, {"scores": each, "seconds": seconds})
+        write_report(
+            self.out,
+            "things",
+            text,
+            {"scores": each, "seconds": seconds, "questions": [vars(o) for o in asked]},
+        )
         print(text)
 
 
@@ -108,6 +117,17 @@ def score(answer: Things, truth: Sequence[TrueThing], scene: str = "") -> Score:
     ious = tuple(box_iou(answer.things[a], seen[b]) for a, b in pairs)
     count = len(answer.things), answer.least, answer.most
     return Score(scene, answer.word, len(seen), len(pairs), false, count, ious)
+
+
+def known(answer: Things, truth: Sequence[TrueThing]) -> Known:
+    """Tell which things found are which true ones, for questions."""
+    own = [thing for thing in truth if thing.word == answer.word]
+    seen, hidden = ([t for t in own if t.seen is shown] for shown in (True, False))
+    true = [Thing(-1 - i, t.word, 1.0, 0, t.center, t.axes, t.size, np.zeros(0, int))
+            for i, t in enumerate(seen)]  # fmt: skip
+    matches: dict[Thing, Thing | None] = {answer.things[a]: true[b] for a, b in matched(answer.things, seen)}
+    free = [thing for thing in answer.things if thing not in matches]
+    return Known(answer, true, matches | {free[a]: None for a, _ in matched(free, hidden)})
 
 
 def matched(things: Sequence[Thing], truth: Sequence[TrueThing]) -> list[tuple[int, int]]:

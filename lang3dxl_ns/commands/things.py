@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 @dataclass(kw_only=True)
 class ListThings:
     """List the single things that words name: windows, portals, towers. --out gets things.json (boxes,
-    scores, photos, what is in what), things.csv, instances.json (COCO boxes in all photos) and things.png
+    scores, photos, relations), things.csv, instances.json (COCO boxes in all photos) and things.png
     (numbered boxes)."""
 
     scene: tyro.conf.Positional[Path | None] = None
@@ -42,7 +42,7 @@ class ListThings:
     def main(self) -> None:
         from lang3dxl_ns.open_scene import load_scene
         from lang3dxl_ns.things.find import things_of
-        from lang3dxl_ns.things.grammar import answer, parse
+        from lang3dxl_ns.things.grammar import answer, parse, unsure
         from lang3dxl_ns.things.sight import sight_of
         from lang3dxl_ns.things.write import write_catalog, write_picture, write_things
 
@@ -69,7 +69,9 @@ class ListThings:
             whole = request.count and not (request.relation or request.without)
             told = by_word[request.word].count if whole else str(len(chosen))
             listed = ", ".join(_described(thing) for thing in chosen)
-            say(f"{text}: {told if request.count else listed or 'none found'}")
+            doubt = None if whole else unsure(request, named)
+            note = f" (unsure, since {doubt})" if doubt else ""
+            say(f"{text}: {told if request.count else listed or 'none found'}{note}")
         if self.out is not None:
             write_catalog(scene, answers, self.out)
             write_picture(scene, answers, self.out / "things.png")

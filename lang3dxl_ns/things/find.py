@@ -16,7 +16,7 @@ from lang3dxl_ns.query.doubt import doubtful, peaks
 from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.rendering import composite
 from lang3dxl_ns.things.join import VIEWS, Joined, join, without_crumbs
-from lang3dxl_ns.things.pieces import LEVELS, Piece, Shown, pieces_of
+from lang3dxl_ns.things.pieces import FILLED, LEVELS, Piece, Shown, pieces_of
 from lang3dxl_ns.things.thing import Sighting, Thing, upright_box
 
 COLORED = 20
@@ -124,17 +124,21 @@ def _views(scene: Scene, heat: Float[Tensor, "n q"]) -> Iterator[list[Shown]]:
         camera = photo.camera
         pose = camera.view_matrix.to(means)
         seen = means @ pose[:3, :3].T + pose[:3, 3]
-        channels = torch.cat([heat.to(means), seen[:, 2:], torch.ones_like(seen[:, 2:])], 1)
-        drawn = composite(splats, camera, channels, scene.backend).cpu().numpy()
-        *maps, depth, alpha = np.moveaxis(drawn, 2, 0)
+        lit = torch.cat([heat.to(means), torch.ones_like(seen[:, 2:])], 1)
+        drawn = composite(splats, camera, torch.cat([lit, lit * seen[:, 2:]], 1), scene.backend)
+        maps, depths = np.split(np.moveaxis(drawn.cpu().numpy(), 2, 0), 2)
         inside = photo.foreground((camera.height, camera.width))
         keep = 1.0 if inside is None else inside.numpy()
-        rows = view.rows.long().cpu().numpy()
+        rows = view.rows[view.pixels >= FILLED].long().cpu().numpy()
         points = seen.cpu().numpy()[rows]
         lens = camera.intrinsics.cpu().numpy()
         points = np.column_stack([(points / points[:, 2:]) @ lens[:2].T, points[:, 2]])
-        surface = depth / np.maximum(alpha, 1e-3)
-        yield [Shown(name, one * keep, surface, rows, points, float(lens[0, 0])) for one in maps]
+        *matched, surface = depths / np.maximum(maps, 1e-4)
+        focal = float(lens[0, 0])
+        yield [
+            Shown(name, one, surface, depth, rows, points, focal)
+            for one, depth in zip(maps[:-1] * keep, matched, strict=True)
+        ]
 
 
 def _thing(

@@ -135,17 +135,25 @@ def answer(request: Request, found: Iterable[Things], sight: Callable[[list[Thin
         ]
     if request.superlative:
         kind, sign = table()["superlatives"][request.superlative]
-        return sorted(chosen, key=lambda thing: sign * _measure(thing, kind, view))[:1]
+        return sorted(chosen, key=lambda thing: sign * measure(thing, kind, view))[:1]
     if request.nth and request.along:
         kind, sign = table()["from"][request.along]
         if len(chosen) < request.nth:
             raise UserError(f"only {len(chosen)} {request.word} found: there is no number {request.nth}")
-        ordered = sorted(chosen, key=lambda thing: sign * _measure(thing, kind, view))
+        ordered = sorted(chosen, key=lambda thing: sign * measure(thing, kind, view))
         return ordered[request.nth - 1 : request.nth]
     return chosen
 
 
-def _measure(thing: Thing, kind: str, view: Sight) -> float:
+def unsure(request: Request, found: Iterable[Things]) -> str | None:
+    """Tell which numbers of things are unsure, so that the answer may be wrong; None if none is."""
+    wide = [one for one in found if one.word in request.words and one.least != one.most]
+    return ", ".join(f"{one.word}: {one.count}" for one in wide) or None
+
+
+def measure(thing: Thing, kind: str, view: Sight) -> float:
+    """Return what superlatives and ordinals compare (`kind`, of the table), in world units or, for a
+    volume, their cube."""
     if kind == "left":
         return float(thing.center @ view.right)
     if kind == "top":

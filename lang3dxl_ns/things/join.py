@@ -22,7 +22,9 @@ VIEWS = 2
 """Number of views that must show a thing: what a single one shows may be a smear."""
 CRUMB = 0.03
 """Weight, relative to the typical thing's (half of all weight is in heavier ones), below which a thing is a
-crumb of another."""
+crumb of another, unless many views show it."""
+OFTEN = 8
+"""Number of views that show a thing from which it is no crumb, however small: a pinnacle beside a spire."""
 MOST_SHARED = 0.5
 """Share of a piece's weight that may belong to known things if it is to be a new one."""
 
@@ -92,9 +94,9 @@ def _united(things: Sequence[Joined], together: set[tuple[int, int]]) -> list[Jo
 
 
 def without_crumbs(things: Sequence[Joined]) -> list[Joined]:
-    """Leave out the things that weigh far less than the typical one."""
+    """Leave out the things that weigh far less than the typical one and that few views show."""
     weights = np.sort([thing.weight for thing in things])[::-1]
     if not len(weights):
         return []
     typical = weights[np.searchsorted(weights.cumsum(), weights.sum() / 2)]
-    return [thing for thing in things if thing.weight >= CRUMB * typical]
+    return [thing for thing in things if thing.weight >= CRUMB * typical or thing.views >= OFTEN]

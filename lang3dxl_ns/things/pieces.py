@@ -16,8 +16,11 @@ LEAST = 6
 """Pixels below which a region is noise."""
 PART = 0.25
 """Share of a region that each of its parts must hold for the region to be split."""
-DEPTH = 0.05
-"""Relative distance from the visible surface within which a Gaussian belongs to a pixel."""
+DEPTH = 0.03
+"""Relative distance from the visible surface, or from what matches, within which a Gaussian belongs to a
+pixel."""
+FILLED = 0.5
+"""Pixels that a Gaussian must fill in a view to belong to a piece of it: fainter ones are seen through."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,8 +50,10 @@ class Shown:
     """Heat map, 0…1."""
     depth: Float[Array, "h w"]
     """Depth of the visible surface, world units."""
+    matched: Float[Array, "h w"]
+    """Mean depth of what matches, world units: panes lie behind the edges of the wall around them."""
     rows: Int[Array, " m"]
-    """Indices of the Gaussians that the view shows."""
+    """Indices of the Gaussians that fill enough of the view."""
     points: Float[Array, "m 3"]
     """Column and row of these Gaussians' centers in pixels, and their depth."""
     focal: float
@@ -62,7 +67,8 @@ def pieces_of(shown: Shown) -> Iterator[Piece]:
     x, y, z = shown.points.T
     inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
     x, y, z, rows = x[inside].astype(int), y[inside].astype(int), z[inside], shown.rows[inside]
-    on = (labels[y, x] > 0) & (abs(z - shown.depth[y, x]) < DEPTH * z)
+    near = (abs(z - shown.depth[y, x]) < DEPTH * z) | (abs(z - shown.matched[y, x]) < DEPTH * z)
+    on = (labels[y, x] > 0) & near
     which, rows = labels[y, x][on], rows[on]
     order = which.argsort(kind="stable")
     ends = np.searchsorted(which[order], np.arange(1, count + 2))

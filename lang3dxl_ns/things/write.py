@@ -19,18 +19,21 @@ from lang3dxl_ns.query.heat_maps import PROMPT_COLORS
 from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.things.find import Things, up_of
 from lang3dxl_ns.things.grammar import Sight, holds
+from lang3dxl_ns.things.sight import sight_of
 from lang3dxl_ns.things.thing import Thing
+
+SIDES = {"left": "left_of", "right": "right_of", "above": "above", "below": "below"}
+SIDES |= {"front": "in_front_of", "behind": "behind"}
+"""Names in the catalog of the relations between neighbors."""
 
 
 def write_catalog(scene: Scene, answers: Sequence[Things], folder: Path) -> None:
-    """Write things.json (boxes, sizes, scores, photos, and the scene graph: what is in what), things.csv and
-    instances.json (COCO boxes in all photos)."""
+    """Write things.json (boxes, sizes, scores, photos, and the scene graph: what is in what, and neighbors),
+    things.csv and instances.json (COCO boxes in all photos)."""
     make_folder(folder)
     things = _each_once(answers)
     up = up_of(scene)
-    view = Sight(up, up, up)  # "in" needs no directions
-    pairs = [(a, b) for a in things for b in things if a.id != b.id and a.size.prod() < b.size.prod()]
-    graph = [[a.id, "in", b.id] for a, b in pairs if holds(a, "in", b, view)]
+    graph = _relations(things, sight_of(scene, things))
     words = [_summary(one) for one in answers]
     content = {"words": words, "things": [t.as_json() for t in things], "relations": graph, "up": up.tolist()}
     write_atomically(folder / "things.json", json.dumps(content, indent=1) + "\n")
@@ -43,6 +46,21 @@ def write_catalog(scene: Scene, answers: Sequence[Things], folder: Path) -> None
         table.writerow([thing.id, thing.word, round(thing.score, 3), thing.views, *numbers, seen])
     write_atomically(folder / "things.csv", rows.getvalue())
     write_atomically(folder / "instances.json", json.dumps(coco(scene, answers)) + "\n")
+
+
+def _relations(things: Sequence[Thing], view: Sight) -> list[list[int | str]]:
+    """List the smaller things that are in larger ones, and for each thing its nearest neighbor to the left,
+    right, above, below, in front and behind, as that photo's viewer sees it that shows most of the things."""
+    pairs = [(a, b) for a in things for b in things if a.size.prod() < b.size.prod()]
+    inside = {(a.id, b.id) for a, b in pairs if holds(a, "in", b, view)}
+    graph: list[list[int | str]] = [[a, "in", b] for a, b in sorted(inside)]
+    for other in things:
+        apart = [a for a in things if a.id != other.id and not {(a.id, other.id), (other.id, a.id)} & inside]
+        near = sorted(apart, key=lambda thing: float(np.linalg.norm(thing.center - other.center)))
+        for relation, name in SIDES.items():
+            first = next((a for a in near if holds(a, relation, other, view)), None)
+            graph += [[first.id, name, other.id]] if first else []
+    return graph
 
 
 def _summary(one: Things) -> dict[str, Any]:

@@ -152,14 +152,16 @@ export class List extends EventTarget {
     const chosen = answerTo(request, things, this.directions), [first] = asked, every = chosen.length === things[request.word].length;
     Object.assign(first, { listed: true, asked: every ? null : new Set(chosen.map(({ id }) => id)) });
     const sure = asked.every(({ trust }) => trust.level === "sure") ? "" : " Not sure: see the cards.";
+    const wide = request.count && every ? [] : asked.filter(({ found }) => found.least !== found.most); // as Python's unsure
+    const note = (wide.length ? ` Unsure, since ${wide.map(({ text, found }) => `${shown(text)}: ${count(found)}`).join(", ")}.` : "") + sure;
     if (request.count) {
       this.dispatchEvent(new Event("change"));
-      return `${every ? count(first.found) : chosen.length} ${shown(request.word)}.${sure}`;
+      return `${every ? count(first.found) : chosen.length} ${shown(request.word)}.${note}`;
     }
     if (chosen.length) this.choose(first, chosen[0]);
     else this.dispatchEvent(new Event("change"));
     const numbers = chosen.map((thing) => things[request.word].indexOf(thing) + 1).join(", ");
-    return (chosen.length ? `${shown(request.word)} ${numbers}.` : `No ${shown(request.word)} fit.`) + sure;
+    return (chosen.length ? `${shown(request.word)} ${numbers}.` : `No ${shown(request.word)} fit.`) + note;
   }
 
   /** Directions of the viewer: right, up and ahead. */

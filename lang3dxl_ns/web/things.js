@@ -2,7 +2,7 @@
 // Python renders the heat that is cut into pieces; here it is drawn from the pixels that each Gaussian fills.
 import language from "./language.js";
 
-const { LEVELS, PART, DEPTH, SHARED, SPLINTER, VIEWS, CRUMB, MOST_SHARED, OUTLIERS, TURNS, COLORED, SAME } = language.things;
+const { LEVELS, PART, DEPTH, FILLED, SHARED, SPLINTER, VIEWS, CRUMB, OFTEN, MOST_SHARED, OUTLIERS, TURNS, COLORED, SAME } = language.things;
 const SIDE = 240, LEAST = 3; // pixels of a view's longer side, and of the smallest piece
 const FAINT = 0.05, TRACE = 0.004, REACH = 2.5, BLUR = 0.3; // relevancy and heat that leave no trace, standard deviations that are drawn, square pixels
 const SHARP = 10, ROUNDS = 12; // inverse strength of the colors' regularization, Newton steps
@@ -134,7 +134,7 @@ export function drawn(view, { centers, axes }, heat) {
     const i = rows[n], p = centers[3 * i] - turn[3], q = centers[3 * i + 1] - turn[7], r = centers[3 * i + 2] - turn[11];
     const z = -(p * turn[2] + q * turn[6] + r * turn[10]), right = (p * turn[0] + q * turn[4] + r * turn[8]) / z, up = (p * turn[1] + q * turn[5] + r * turn[9]) / z;
     const x = cx + fx * right, y = cy - fy * up;
-    (points[3 * n] = x), (points[3 * n + 1] = y), (points[3 * n + 2] = z);
+    (points[3 * n] = x), (points[3 * n + 1] = y), (points[3 * n + 2] = sizes[codes[n]] * view.width * view.height < FILLED ? NaN : z); // NaN belongs to no piece
     if (heat[i] <= FAINT || !(z > 0)) continue;
     const sideways = Math.max(-1, Math.min(right, 1)), upwards = Math.max(-1, Math.min(up, 1));
     let uu = BLUR, uv = 0, vv = BLUR; // covariance of its footprint, square pixels
@@ -267,12 +267,12 @@ function united(things, together) {
   })); // prettier-ignore
 }
 
-/** Leave out the things that weigh far less than the typical one. */
+/** Leave out the things that weigh far less than the typical one and that few views show. */
 export function withoutCrumbs(things) {
   const weights = things.map(({ weight }) => weight).sort((a, b) => b - a), all = weights.reduce((sum, value) => sum + value, 0);
   let before = 0;
   const typical = weights.find((value) => (before += value) >= all / 2) ?? 0;
-  return things.filter(({ weight }) => weight >= CRUMB * typical);
+  return things.filter((thing) => thing.weight >= CRUMB * typical || photosOf(thing).size >= OFTEN);
 }
 
 /** Find the upright box with the smallest base around weighted Gaussians: { center, axes, size }. */

@@ -72,8 +72,8 @@ _SUGGESTED = (
 """Words that a first visitor is offered, where the scene knows them."""
 _RANKING = ("PEAK", "LARGE", "RIM", "STRONG", "CORE", "JOINED", "OUTLIERS", "DENSE")
 _THINGS = (
-    (pieces, "LEVELS PART DEPTH"),
-    (join, "SHARED SPLINTER VIEWS CRUMB MOST_SHARED"),
+    (pieces, "LEVELS PART DEPTH FILLED"),
+    (join, "SHARED SPLINTER VIEWS CRUMB OFTEN MOST_SHARED"),
     (thing, "OUTLIERS TURNS"),
     (find, "COLORED SAME"),
     (grammar, "BESIDE INSIDE"),

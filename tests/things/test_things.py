@@ -1,17 +1,22 @@
 """Laws of things: pieces, joining, boxes and questions, on scenes that are drawn by hand."""
 
+import json
+
 import numpy as np
 import pytest
 from painted_scene import painted_scene
 
+from lab.benchmarks.questions import Known, ask_all
 from lab.landmark.instances import true_things
 from lab.landmark.landmark import Landmark
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.things.find import Things, things_of
-from lang3dxl_ns.things.grammar import Request, Sight, answer, parse, table
-from lang3dxl_ns.things.join import join, without_crumbs
+from lang3dxl_ns.things.grammar import Request, Sight, answer, parse, table, unsure
+from lang3dxl_ns.things.join import OFTEN, join, without_crumbs
 from lang3dxl_ns.things.pieces import Piece, Shown, pieces_of, split
+from lang3dxl_ns.things.sight import sight_of
 from lang3dxl_ns.things.thing import Thing, upright_box
+from lang3dxl_ns.things.write import write_catalog
 
 SIGHT = Sight(np.array([1.0, 0, 0]), np.array([0, 0, 1.0]), np.array([0, 1.0, 0]))
 
@@ -43,9 +48,11 @@ def test_a_region_splits_where_it_falls_apart_and_only_there():
 def test_hidden_gaussians_belong_to_no_piece():
     heat, depth = bumps(20), np.full((20, 60), 5.0)
     points = np.array([[20, 10, 5.0], [20, 10, 9.0], [50, 10, 5.0]])
-    (found,) = pieces_of(Shown("a", heat, depth, np.array([7, 8, 9]), points, 100.0))
+    (found,) = pieces_of(Shown("a", heat, depth, depth, np.array([7, 8, 9]), points, 100.0))
     assert found.rows.tolist() == [7]
     assert found.resolution == pytest.approx(20)
+    (deep,) = pieces_of(Shown("a", heat, depth, depth + 4, np.array([7, 8, 9]), points, 100.0))
+    assert deep.rows.tolist() == [7, 8]  # a pane behind the wall's edge
 
 
 def test_a_coarse_view_does_not_join_what_a_fine_one_tells_apart():
@@ -68,6 +75,15 @@ def test_crumbs_go_and_equals_stay():
     found = without_crumbs(join([piece("a", rows, 1.0) for rows in sizes], np.ones(202)))
     assert [len(one.rows) for one in found] == [100, 100]
     assert without_crumbs([]) == []
+
+
+def test_many_views_tell_that_a_small_thing_is_no_crumb():
+    sizes = [np.arange(100), np.arange(100, 102), np.arange(102, 104)]
+    shown = [piece(str(v), rows, 1.0) for rows, n in zip(sizes, (2, OFTEN, OFTEN - 1), strict=True)
+             for v in range(n)]  # fmt: skip
+    found = without_crumbs(join(shown, np.ones(104)))
+    assert [len(one.rows) for one in found] == [100, 2]
+    assert 100 in found[1].rows
 
 
 def test_a_box_turns_with_its_points():
@@ -159,3 +175,50 @@ def test_a_thing_keeps_its_id_in_later_questions_and_under_other_words():
     assert {one.id for one in first.things} == {one.id for one in again.things}
     (alone,) = things_of(painted_scene(), "window")
     assert {one.id for one in alone.things} == {one.id for one in first.things}
+
+
+def test_the_catalog_names_the_nearest_neighbors_and_what_is_in_what(tmp_path):
+    scene = painted_scene()
+    row = [thing(i, "window", (x, 0, 5)) for i, x in enumerate([0, 3, 9])]
+    everywhere = thing(9, "wall", (4, 0, 5), (20, 1, 10))
+    view = sight_of(scene, row)
+    write_catalog(scene, [Things("window", row, 3, 3), Things("wall", [everywhere], 1, 1)], tmp_path)
+    graph = json.loads((tmp_path / "things.json").read_text())["relations"]
+    assert [[a, b] for a, name, b in graph if name == "in"] == [[0, 9], [1, 9], [2, 9]]
+    side, other = ("left_of", "right_of") if view.right[0] > 0 else ("right_of", "left_of")
+    assert [0, side, 1] in graph
+    assert [1, other, 0] in graph
+    assert [0, side, 2] not in graph  # the one between is nearer
+    assert [1, side, 2] in graph
+
+
+def test_generated_questions_are_right_where_all_is_found_and_tell_what_is_missed():
+    scene = painted_scene()
+    rng = np.random.default_rng(0)
+    true = [thing(i, "window", rng.uniform(0, 9, 3), rng.uniform(0.5, 2, 3)) for i in range(5)]
+    true += [thing(9, "portal", (4.5, 0, 0), (2, 1, 4))]
+
+    def outcomes(missed: int, least: int = 5):
+        known = {}
+        for word in ("window", "portal"):
+            own = [one for one in true if one.word == word]
+            found = [one for one in own if one.id != missed]
+            sure = len(found) if word == "portal" else least
+            known[word] = Known(Things(word, found, sure, len(found)), own, {one: one for one in found})
+        return ask_all(scene, known)
+
+    every = outcomes(missed=-1)
+    assert len(every) > 50
+    assert all(one.right and one.right_if_found for one in every)
+    assert not any(one.cautious for one in every if not one.question.startswith("how many"))
+    some = outcomes(missed=2, least=3)
+    assert all(one.right_if_found for one in some)
+    assert 0 < sum(one.right for one in some) < len(some)
+    assert all(one.cautious for one in some if not one.right and "portal from" not in one.question
+               and not one.question.startswith("how many"))  # fmt: skip
+
+
+def test_an_answer_tells_which_numbers_are_unsure():
+    found = [Things("window", [thing(1, "window", (0, 0, 0))], 1, 1), Things("portal", [], 0, 4)]
+    assert unsure(parse("highest window"), found) is None
+    assert unsure(parse("window above the portal"), found) == "portal: 0, perhaps 0 to 4"
