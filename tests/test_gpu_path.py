@@ -14,6 +14,7 @@ from conftest import make_trainer
 from fake_gpu import CUDA, GpuTensor, fake_gpu, real_gpu
 from scenes import write_scene
 
+import lang3dxl_ns.methods  # noqa: F401  (its defaults look for a GPU once: before there is a fake one)
 from lab.baselines import BASELINES, langsplat
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.components.compression import CompressedField
