@@ -7,6 +7,7 @@ Runs are a few steps on a tiny scene; they are made once and shared.
 
 from dataclasses import replace
 from functools import cache
+from importlib import import_module
 
 import pytest
 import torch
@@ -14,7 +15,6 @@ from conftest import make_trainer
 from fake_gpu import CUDA, GpuTensor, fake_gpu, real_gpu
 from scenes import write_scene
 
-import lang3dxl_ns.methods  # noqa: F401  (its defaults look for a GPU once: before there is a fake one)
 from lab.baselines import BASELINES, langsplat
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.components.compression import CompressedField
@@ -57,6 +57,7 @@ def small(tmp_path_factory):
 @pytest.fixture(scope="module")
 def trained(gpu, small, tiny_clip, tiny_dense, tmp_path_factory):
     """Trains on the GPU and returns the trainer, with `waits`: the counted waits of every step."""
+    import_module("lang3dxl_ns.methods")  # its defaults look for a GPU once: before there is a fake one
 
     def run(iterations=4, semantics=True, fake=None, **changes):
         changes = {"machine__device_type": "cuda", "steps_per_eval_image": 0, **changes}
