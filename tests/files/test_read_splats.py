@@ -531,7 +531,11 @@ SPZ = struct.Struct("<IIIBBBB")
     ("name", "content", "said"),
     [
         ("a.spz", SPZ.pack(0x5053474E, 9, 1, 0, 12, 0, 0), "SPZ of version 9; 1 to 4 can be read"),
-        ("a.spz", gzip.compress(SPZ.pack(0x5053474E, 3, 1, 7, 12, 0, 0), mtime=0), "have degree 7; 0 to 4 can be"),
+        (
+            "a.spz",
+            gzip.compress(SPZ.pack(0x5053474E, 3, 1, 7, 12, 0, 0), mtime=0),
+            "have degree 7; 0 to 4 can be",
+        ),
         ("a.ply", HEAD.format("quark").encode(), "column x has the type quark"),
         ("a.ply", HEAD.format("float").encode(), "no y, z, opacity"),
         ("a.ply", TEN.encode(), "has 10 columns f_rest, not 9, 24, 45 or 72"),
