@@ -44,8 +44,10 @@ export function promptCard(prompt, { fly, remove, rename, dragThreshold, setThre
   const name = shown(text) + (negatives.length ? ` not ${negatives.map((one) => shown(one)).join(", ")}` : "");
   const go = element("button", { className: "small fly", disabled: !views?.some((one) => one.shown), onclick: () => fly(prompt) }, "Fly to");
   const away = element("button", { className: "small", ariaLabel: `Remove ${shown(text)}`, onclick: () => remove(prompt) }, "×");
-  const heading = examples ? element("input", { value: text, ariaLabel: "Name", maxLength: 60 }) : element("strong", {}, name);
-  heading.addEventListener("change", () => rename(prompt, heading.value));
+  const heading = examples ? element("input", { defaultValue: text, ariaLabel: "Name", maxLength: 60 }) : element("strong", {}, name);
+  const named = () => heading.kept || heading.value === heading.defaultValue || rename(prompt, (heading.defaultValue = heading.value));
+  if (examples) for (const event of ["change", "blur"]) heading.addEventListener(event, named);
+  heading.addEventListener("keydown", ({ key }) => key === "Enter" && named());
   const button = (label, act, pressed) => element("button", { className: "small", ariaPressed: pressed, onclick: () => act(prompt) }, label);
   card.append(element("header", {}, heading, ...(examples ? [button(open ? "Done" : "Add", teach, open)] : []), go, away));
   if (open) {

@@ -156,12 +156,22 @@ function draw(newest = null) {
   const acts = { fly, remove, rename, dragThreshold, setThreshold, teach, outline, save, forget }, focused = document.activeElement;
   list.tidy();
   const [from, label] = [prompts.find(({ card }) => card?.contains(focused)), focused?.ariaLabel ?? focused?.textContent];
+  const typing = from && focused.matches("header input") && focused.value !== focused.defaultValue;
+  const caret = typing && [focused.selectionStart, focused.selectionEnd];
   for (const prompt of prompts) {
     prompt.card = promptCard(prompt, acts, about);
     prompt.card.append(list.part(prompt) ?? "");
   }
+  if (typing) {
+    focused.kept = true; // a name that is half typed when an answer arrives: it leaves the page for a moment, but isn't done
+    from.card.querySelector("header input").replaceWith(focused);
+  }
   $("prompts").replaceChildren(...prompts.map(({ card }) => card));
   [...(from?.card.querySelectorAll("button, input") ?? [])].find((one) => (one.ariaLabel ?? one.textContent) === label)?.focus();
+  if (typing) {
+    focused.kept = false;
+    focused.setSelectionRange(...caret);
+  }
   $("try").hidden = prompts.length > 0;
   view.recolor(prompts.filter((prompt) => prompt.relevancy));
   newest?.card.scrollIntoView({ block: "nearest" });

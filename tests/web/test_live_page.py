@@ -222,6 +222,27 @@ def test_a_word_taught_in_the_page_is_in_the_scenes_file_and_in_the_page(browser
         page.close()
 
 
+def test_a_name_that_is_half_typed_stays_when_an_answer_arrives(browser, file, tmp_path):  # noqa: F811
+    write_page(Page(read_scene(file, "cpu")), tmp_path / "page")
+    with served(tmp_path / "page") as address:
+        page = opened(browser, address, DESK)
+        page.evaluate("lang3dxl.ask('dome')")
+        page.evaluate("lang3dxl.ready.then(() => true)")
+        page.get_by_role("button", name="Teach a word").click()
+        name = page.get_by_role("textbox", name="Name")
+        name.click(click_count=3)
+        page.keyboard.type("giz")
+        page.evaluate("lang3dxl.ask('wall')")  # draws all cards anew
+        page.keyboard.type("mo")
+        assert name.input_value() == "gizmo"
+        page.evaluate("lang3dxl.ask('sky')")
+        named = "lang3dxl.prompts.filter(({ examples }) => examples).map(({ text }) => text)"
+        assert page.evaluate(named) == ["like this 1"]  # it isn't done yet
+        page.keyboard.press("Enter")
+        assert page.evaluate(named) == ["gizmo"]
+        page.close()
+
+
 @pytest.mark.slow
 def test_a_static_page_writes_words_that_the_scene_learns_as_if_marked_there(browser, file, photos, tmp_path):  # noqa: F811
     scene = read_scene(file, "cpu")
