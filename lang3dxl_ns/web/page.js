@@ -167,7 +167,7 @@ function draw(newest = null) {
     from.card.querySelector("header input").replaceWith(focused);
   }
   $("prompts").replaceChildren(...prompts.map(({ card }) => card));
-  [...(from?.card.querySelectorAll("button, input") ?? [])].find((one) => (one.ariaLabel ?? one.textContent) === label)?.focus();
+  [...(from?.card.querySelectorAll("button, input, summary") ?? [])].find((one) => (one.ariaLabel ?? one.textContent) === label)?.focus();
   if (typing) {
     focused.kept = false;
     focused.setSelectionRange(...caret);
