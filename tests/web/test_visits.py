@@ -91,6 +91,7 @@ def test_every_stop_of_the_tabulator_is_seen_named_and_outlined(browser, address
     with visit(browser, address, size) as page:
         page.evaluate("lang3dxl.ask('dome; windows')")
         page.evaluate("document.getElementById('more').open = true")
+        page.locator("#prompts summary", has_text="found").nth(1).wait_for()  # then no card is drawn anew
         stops = []
         while not stops or (len(stops) < 80 and not page.evaluate(FOCUSED)["body"]):
             page.keyboard.press("Tab")
