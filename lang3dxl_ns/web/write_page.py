@@ -82,7 +82,7 @@ _THINGS = (
 _TEXTS = 256
 """Number of texts encoded at a time."""
 _DATA = re.compile(
-    r"(splats|codes|field|rows|vocabulary|views|look\d+|photo\d+|part\d+)\.[0-9a-f]{12}\.(bin|json|jpg)"
+    r"(splats|codes|field|rows|floaters|vocabulary|views|look\d+|photo\d+|part\d+)\.[0-9a-f]{12}\.(bin|json|jpg)"
 )
 """Names of a page's data files. Nothing else in its folder is ever deleted."""
 MOST_TEXT = 2_000
@@ -142,10 +142,8 @@ class Page:
         means = scene.splats.means[scene.splats.sound()]
         center = means.median(0).values if len(means) else self._toward
         files = {path.name: path.read_bytes() for path in _FILES}
-        files["language.js"], files["spark.bin"] = (
-            language_module(),
-            gzip.compress(_LIBRARY.read_bytes(), mtime=0),
-        )
+        files["language.js"] = language_module()
+        files["spark.bin"] = gzip.compress(_LIBRARY.read_bytes(), mtime=0)
         files["splats.bin"] = pack_splats(scene.baked(self.look), center, self._toward).tobytes()
         up = np.mean([photo.pose[:3, 1] for photo in scene.photos], axis=0)
         told = self.provenance

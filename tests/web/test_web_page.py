@@ -33,7 +33,7 @@ from lang3dxl_ns.query.doubt import LEAST_PEAK, peaks
 from lang3dxl_ns.query.question import QueryConfig
 from lang3dxl_ns.query.scene import NO_SEMANTICS
 from lang3dxl_ns.query.vocabulary import common_words, shipped_vocabulary, whole_words
-from lang3dxl_ns.web.write_page import Page, write_page
+from lang3dxl_ns.web.write_page import _DATA, Page, write_page
 from lang3dxl_ns.words.taught_words import Example, TaughtWord
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
@@ -873,6 +873,7 @@ def test_a_page_of_other_people_is_not_replaced(scene, tmp_path):
     after = set(json.loads((own.parent / "scene.json").read_text())["files"].values())
     left = {path.name for path in own.parent.iterdir()}
     assert before - after and not (before - after) & left and after <= left
+    assert all(_DATA.fullmatch(name) for name in before)  # or it would stay for ever
     assert {"CNAME", "model.bin"} <= left
 
 
