@@ -23,8 +23,10 @@ OF_SPLATFACTO = (
 OF_IMAGE_CACHES = (
     *("masks_on_gpu", "images_on_gpu", "cache_images", "cache_images_type", "max_thread_workers"),
     *("eval_num_images_to_sample_from", "eval_num_times_to_repeat_images", "eval_image_indices"),
+    *("train_cameras_sampling_strategy", "fps_reset_every"),
 )
-"""Settings of nerfstudio's photo caches, which one bounded cache replaces here."""
+"""Settings of nerfstudio's photo caches and its order of photos, which one bounded cache and rounds of all
+photos replace here."""
 OF_COLMAP = (
     *("downscale_rounding_mode", "depths_path", "depth_unit_scale_factor", "max_2D_matches_per_3D_point"),
     "load_3D_points",
