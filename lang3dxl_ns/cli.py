@@ -38,7 +38,7 @@ BENCHMARKS = {
     "pt-ovs": ("lab.benchmarks.published:PtOvs", "PT-OVS, scene by scene."),
     "teaching": ("lab.benchmarks.teaching:TeachingBenchmark", "Words taught by example, beside the text."),
     "trust": ("lab.benchmarks.trust:TrustBenchmark", "Cautions under wrong answers, and under right ones."),
-    "page": ("lab.benchmarks.page_speed:PageBenchmark", "Seconds until the page of a scene answers."),
+    "page": ("lab.benchmarks.page:PageBenchmark", "Seconds until the page of a scene answers."),
     "things": ("lab.benchmarks.things:ThingsBenchmark", "Single windows and towers: F1, counts, boxes."),
     "attach": ("lab.benchmarks.attach:AttachBenchmark", "Words attached to a splat, beside its run's."),
 }

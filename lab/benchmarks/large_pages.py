@@ -1,6 +1,6 @@
 """The page of large scenes in Chromium: bytes and seconds to picture and answer, memory, and frames.
 
-    python -m lab.benchmarks.page RUN --sizes 18000 300000 1000000 3000000
+    python -m lab.benchmarks.large_pages RUN --sizes 18000 300000 1000000 3000000
 
 Large scenes are copies of a trained one, side by side. WebGL runs in software here: a machine with a GPU
 draws frames many times faster.
@@ -10,29 +10,20 @@ from __future__ import annotations
 
 import argparse
 import math
-import shutil
 import tempfile
-import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
-from functools import partial
-from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
 import torch
 
+from lab.benchmarks.chromium import Counting, chromium, served
 from lang3dxl_ns import load_scene
 from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.web.write_page import Page, write_page
 
 WINDOWS = {"phone": (390, 844), "desk": (1440, 900)}
-_SWITCHES = [
-    *("--headless", "--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader"),
-    *("--enable-unsafe-swiftshader", "--enable-precise-memory-info"),
-]
 _WORD = "dome"
 _DRAWN = """async () => {
   while ((window.lang3dxl?.view?.cost ?? 160) === 160) await new Promise((go) => setTimeout(go, 20));
@@ -82,28 +73,6 @@ def tiled(scene: Scene, count: int) -> Scene:
     return large
 
 
-class _Counting(SimpleHTTPRequestHandler):
-    """Handler that counts the bytes that it sends."""
-
-    sent = 0
-
-    def copyfile(self, source: Any, outputfile: Any) -> None:
-        content = source.read()
-        type(self).sent += len(content)
-        outputfile.write(content)
-
-    def log_message(self, *_: object) -> None:
-        """Log nothing."""
-
-
-@contextmanager
-def _served(folder: Path) -> Iterator[str]:
-    server = ThreadingHTTPServer(("127.0.0.1", 0), partial(_Counting, directory=str(folder)))
-    threading.Thread(target=server.serve_forever, daemon=True).start()
-    yield f"http://127.0.0.1:{server.server_port}/"
-    server.shutdown()
-
-
 def measured(browser: Any, folder: Path, window: tuple[int, int]) -> list[str]:
     """Open a page and return what it takes, as cells of a table."""
     width, height = window
@@ -112,13 +81,13 @@ def measured(browser: Any, folder: Path, window: tuple[int, int]) -> list[str]:
         viewport={"width": width, "height": height}, has_touch=phone, is_mobile=phone
     )
     page = context.new_page()
-    with _served(folder) as address:
-        _Counting.sent, start = 0, time.perf_counter()
+    with served(folder) as address:
+        Counting.sent, start = 0, time.perf_counter()
         page.goto(address, wait_until="commit")
         page.evaluate(_DRAWN)
-        drawn, picture = _Counting.sent, time.perf_counter() - start
+        drawn, picture = Counting.sent, time.perf_counter() - start
         page.evaluate(_ANSWERED)
-        answered, answer = _Counting.sent, time.perf_counter() - start
+        answered, answer = Counting.sent, time.perf_counter() - start
         held = page.evaluate(_SETTLED)
         frames = page.evaluate(_DRAG)
         memory = page.evaluate("performance.memory.usedJSHeapSize")
@@ -129,8 +98,6 @@ def measured(browser: Any, folder: Path, window: tuple[int, int]) -> list[str]:
 
 def main() -> None:
     """Print the table."""
-    from playwright.sync_api import sync_playwright
-
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("run", type=Path)
     parser.add_argument("--sizes", type=int, nargs="+", default=[18_000, 300_000, 1_000_000, 3_000_000])
@@ -138,8 +105,7 @@ def main() -> None:
     scene = load_scene(options.run)
     print("| Gaussians | window | MB, picture | s | MB, answer | s | MB, heap | held | frames a second |")
     print("|---" * 9 + "|")
-    with sync_playwright() as p, tempfile.TemporaryDirectory() as kept:
-        browser = p.chromium.launch(executable_path=shutil.which("chromium"), args=_SWITCHES)
+    with chromium() as browser, tempfile.TemporaryDirectory() as kept:
         for size in options.sizes:
             large, folder = tiled(scene, size), Path(kept) / str(size)
             write_page(Page(large), folder)

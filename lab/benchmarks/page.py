@@ -2,28 +2,16 @@
 
 from __future__ import annotations
 
-import shutil
-import threading
 from dataclasses import dataclass
-from functools import partial
-from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from statistics import median
 from tempfile import TemporaryDirectory
-from typing import Any
 
+from lab.benchmarks.chromium import chromium, served
 from lab.reports import command_line
-from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.reports import markdown_table, write_report
 from lang3dxl_ns.common.settings_help import showing
 
-SWITCHES = (
-    "--headless",
-    "--no-sandbox",
-    "--use-gl=angle",
-    "--use-angle=swiftshader",
-    "--enable-unsafe-swiftshader",
-)
 GOALS = {"a word's heat": 0.15, "a dragged threshold": 0.1, "a word taught by a click": 1.0}
 """Most seconds at 10,000 Gaussians, until colors are given to the drawing, which takes as long as a machine's
 graphics do."""
@@ -87,31 +75,12 @@ class PageBenchmark:
         print(text)
 
     def measured(self, folder: Path) -> dict[str, list[float]]:
-        """Open a page in Chromium and measure it. Raises UserError without Chromium or playwright."""
-        try:
-            from playwright.sync_api import sync_playwright
-        except ModuleNotFoundError as error:
-            raise UserError("playwright drives the browser: pip install -e '.[test]'") from error
-        program = next(
-            filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
-        )
-        if program is None:
-            raise UserError("there is no Chromium on this machine: apt install chromium")
-        server = ThreadingHTTPServer(("127.0.0.1", 0), partial(_Quiet, directory=str(folder)))
-        threading.Thread(target=server.serve_forever, daemon=True).start()
-        with sync_playwright() as play:
-            browser = play.chromium.launch(executable_path=program, args=SWITCHES)
+        """Open a page in Chromium and measure it."""
+        with chromium() as browser, served(folder) as address:
             page = browser.new_page(viewport={"width": 720, "height": 450}, reduced_motion="reduce")
             page.set_default_timeout(300_000)
-            page.goto(f"http://127.0.0.1:{server.server_port}/")
+            page.goto(address)
             page.evaluate("lang3dxl.ready.then(() => true)")
             page.evaluate(_TIMES, [WORDS, 2])  # compiles
             times: dict[str, list[float]] = page.evaluate(_TIMES, [WORDS, self.repeats])
-            browser.close()
-        server.shutdown()
         return times
-
-
-class _Quiet(SimpleHTTPRequestHandler):
-    def log_message(self, *_: Any) -> None:
-        """Log nothing."""
