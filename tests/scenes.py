@@ -5,6 +5,7 @@ from scenes import write_scene
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np  # before pycolmap: the other way round, Pillow's PNG writer aborts the process
@@ -12,6 +13,7 @@ from PIL import Image
 
 CENTER = np.array([0.0, 0.0, 0.5])
 HALF_SIZES = np.array([1.2, 0.6, 0.5])  # world units; the box stands on the ground, z is up
+Paint = Callable[[np.ndarray], np.ndarray]
 FACES = np.array([[0.9, 0.5, 0.3], [0.4, 0.6, 0.9], [0.5, 0.8, 0.4]])  # color by the face's normal axis
 
 
@@ -27,6 +29,7 @@ def write_scene(
     shuffled: bool = False,
     duplicates: int = 0,
     coarseness: int = 1,
+    paint: Paint | None = None,
 ) -> Path:
     """Write `folder`/images/photo_000.jpg … and `folder`/sparse/0/*.bin; returns `folder`.
 
@@ -34,12 +37,12 @@ def write_scene(
     size, focal length and principal point, every third one portrait; otherwise all share one camera.
     `distortion` is OpenCV's k1 k2 p1 p2. `shuffled` lists the photos in another order in the model. The last
     `duplicates` photos are the first once more. Squares of `coarseness` pixels have one color: a ray for
-    each pixel of a large photo takes long. Every point has a track of at least two photos that see it
-    unhidden.
+    each pixel of a large photo takes long. `paint` colors points on the box, 0…1 (default: `texture`). Every
+    point has a track of at least two photos that see it unhidden.
     """
     import pycolmap
 
-    rng = np.random.default_rng(seed)
+    rng, paint = np.random.default_rng(seed), paint or texture
     model = pycolmap.Reconstruction()
     ids = np.random.default_rng(1).permutation(photos) + 1 if shuffled else np.arange(photos) + 1
     cameras = [_camera(pycolmap, i + 1, size, distortion, rng if mixed else None) for i in range(photos)]
@@ -56,7 +59,7 @@ def write_scene(
     (folder / "images").mkdir(parents=True)
     for i, (camera, pose, (pixels, visible)) in enumerate(zip(cameras, poses, seen, strict=True)):
         name = f"photo_{i:03d}.{image_ext}"
-        Image.fromarray(_render(camera, pose, coarseness)).save(folder / "images" / name, quality=95)
+        Image.fromarray(_render(camera, pose, coarseness, paint)).save(folder / "images" / name, quality=95)
         image = pycolmap.Image(
             name=name,
             keypoints=pixels[visible & tracked],
@@ -71,7 +74,7 @@ def write_scene(
             if visible[index]:
                 track.add_element(int(ids[i]), int(np.count_nonzero((visible & tracked)[:index])))
         model.add_point3D(
-            surface[index], track, np.round(texture(surface[index][None])[0] * 255).astype(np.uint8)
+            surface[index], track, np.round(paint(surface[index][None])[0] * 255).astype(np.uint8)
         )
     (folder / "sparse" / "0").mkdir(parents=True)
     model.write_binary(folder / "sparse" / "0")
@@ -129,7 +132,7 @@ def _project(camera, pose: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, 
     return pixels, inside & (np.abs(reach - 1) < 1e-6)
 
 
-def _render(camera, pose: np.ndarray, step: int) -> np.ndarray:
+def _render(camera, pose: np.ndarray, step: int, paint: Paint) -> np.ndarray:
     """[h, w, 3] uint8 photo: one ray through the middle of every square of `step` pixels a side."""
     rows, columns = np.mgrid[: camera.height : step, : camera.width : step] + step / 2
     plane = camera.cam_from_img(np.column_stack([columns.ravel(), rows.ravel()]))
@@ -139,7 +142,7 @@ def _render(camera, pose: np.ndarray, step: int) -> np.ndarray:
     hit = np.isfinite(reach)
     up = directions[:, 2] / np.linalg.norm(directions, axis=1)
     colors = np.array([0.75, 0.8, 0.9]) + 0.3 * up[:, None] * [-1, -0.6, 0.2]  # the sky
-    colors[hit] = texture(position + reach[hit, None] * directions[hit])
+    colors[hit] = paint(position + reach[hit, None] * directions[hit])
     photo = np.round(colors.clip(0, 1) * 255).astype(np.uint8).reshape(*rows.shape, 3)
     return photo.repeat(step, 0).repeat(step, 1)[: camera.height, : camera.width]
 

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import scenes
 import torch
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from PIL import Image
@@ -28,9 +27,7 @@ needs_ffmpeg = pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="ffmpeg
 def walk(tmp_path_factory):
     """Photos of a speckled box, flat in a folder."""
     folder = tmp_path_factory.mktemp("walk")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(scenes, "texture", speckled)
-        write_scene(folder / "scene", photos=8, size=(240, 180))
+    write_scene(folder / "scene", photos=8, size=(240, 180), paint=speckled)
     return folder / "scene" / "images"
 
 

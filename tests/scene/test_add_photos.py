@@ -6,7 +6,6 @@ import shutil
 import numpy as np  # before pycolmap
 import pycolmap
 import pytest
-import scenes
 from PIL import Image
 from scenes import speckled, write_scene
 
@@ -26,9 +25,7 @@ LATE = ("photo_002.jpg", "photo_005.jpg")
 def made(tmp_path_factory):
     """A reconstruction of five photos of a speckled box, two further photos in late/, and the true model."""
     folder = tmp_path_factory.mktemp("made")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(scenes, "texture", speckled)
-        write_scene(folder / "true", photos=7, size=(240, 180))
+    write_scene(folder / "true", photos=7, size=(240, 180), paint=speckled)
     shutil.copytree(folder / "true" / "images", folder / "data" / "images")
     (folder / "late").mkdir()
     for name in LATE:

