@@ -157,15 +157,15 @@ def score_photos(
     Raises:
         UserError: no photo can be read, or words are to be scored and the run has none yet.
     """
-    scorer_of = _Photos(run, data, scorer)
+    photos = _Photos(run, data, scorer)
     if scorer is not None:
-        scorer_of.lift_labels(names)
+        photos.lift_labels(names)
     for number, (view, batch) in enumerate(tracked(data.read(names), "evaluating", len(names))):
         if number == 0:  # warm-up, excluded from timing
-            scorer_of.score(view, batch)
-        evaluated = scorer_of.score(view, batch)
+            photos.score(view, batch)
+        evaluated = photos.score(view, batch)
         if fits_looks:
-            evaluated.images["fitted"], figures = scorer_of.half_image(view, batch)
+            evaluated.images["fitted"], figures = photos.half_image(view, batch)
             evaluated.metrics = figures | evaluated.metrics
         yield evaluated
 

@@ -117,11 +117,8 @@ class _Glb:
     def values(self, number: int, side: int) -> Float32[Array, "n side"]:
         """Return the values of an accessor, `side` of them a row."""
         accessor = self.about["accessors"][number]
-        kind, count, offset = (
-            _KINDS[accessor["componentType"]],
-            accessor["count"],
-            accessor.get("byteOffset", 0),
-        )
+        kind, count = _KINDS[accessor["componentType"]], accessor["count"]
+        offset = accessor.get("byteOffset", 0)
         expect(_SIDES[accessor["type"]] == side and "sparse" not in accessor, "an attribute has another form")
         content = self.view(accessor["bufferView"])
         size = count * side * np.dtype(kind).itemsize

@@ -20,8 +20,8 @@ from lang3dxl_ns.files.spz import encode_spz
 from lang3dxl_ns.rendering import Splats
 
 _WRITERS: dict[str, Callable[[Splats], bytes]] = {
-    **{".ply": encode_ply, ".spz": encode_spz, ".sog": encode_sog, ".glb": encode_glb}
-}
+    ".ply": encode_ply, ".spz": encode_spz, ".sog": encode_sog, ".glb": encode_glb,
+}  # fmt: skip
 SPLAT_NAMES = ".ply, .spz, .sog or .glb"
 
 

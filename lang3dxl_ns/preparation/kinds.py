@@ -106,14 +106,9 @@ class CropGrid(Target):
     fast: Crops
 
     def make(self, image: Float[Tensor, "h w 3"], networks: Networks) -> dict[str, Tensor]:
-        lit, encode, size = (
-            networks.clip.in_known_light(image),
-            networks.clip.encode_images,
-            networks.clip.crop_size,
-        )
-        return vars(
-            build_clip_target(lit, self.crops.sides, encode, size, networks.crop_batch, self.crops.steps)
-        )
+        clip, crops, batch = networks.clip, self.crops, networks.crop_batch
+        lit, encode = clip.in_known_light(image), clip.encode_images
+        return vars(build_clip_target(lit, crops.sides, encode, clip.crop_size, batch, crops.steps))
 
     def numbers(self, networks: Networks) -> int:
         return math.prod(self.crops.grid(self.photo.height, self.photo.width)) * (networks.clip.dim + 1)

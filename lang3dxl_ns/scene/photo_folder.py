@@ -94,7 +94,7 @@ def readable(photos: PhotoFolder) -> tuple[PhotoFolder, dict[str, str]]:
         try:
             with open_picture(path) as image:
                 image.load() if image.format == "GIF" else image.verify()  # which reads nothing of a GIF
-            if _is_panorama(path):
+            if _is_panorama(path):  # opened again: a verified picture tells nothing more
                 bad[name] = "a panorama, which no lens takes: use single photos, or cut views out of it"
             else:
                 good.append(name)

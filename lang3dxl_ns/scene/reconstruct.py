@@ -239,12 +239,7 @@ def feature_database(
     database, stamped = work / "database.db", work / _STAMP
     if database.is_file() and stamped.is_file() and stamped.read_text() == stamp:
         return database
-    for old in (
-        stamped,
-        *work.glob("database.db*"),
-        *work.glob("importing.db*"),
-        *work.glob("xfeat/*"),
-    ):
+    for old in (stamped, *work.glob("database.db*"), *work.glob("importing.db*"), *work.glob("xfeat/*")):
         old.unlink(missing_ok=True)
     importing = work / "importing.db"
     pycolmap.Database.open(importing).close()
