@@ -298,7 +298,7 @@ def _peak() -> float:
 @torch.no_grad()
 def _time_answers(pipeline: Lang3DXLPipeline) -> dict[str, float]:
     """Measure the median milliseconds to render a held-out view, and to answer all prompts in it."""
-    from lang3dxl_ns.plugin.cameras import to_rasterizer
+    from lang3dxl_ns.plugin.cameras import photo_camera
 
     scorer = pipeline.evaluation.scorer
     if scorer is None:
@@ -310,7 +310,7 @@ def _time_answers(pipeline: Lang3DXLPipeline) -> dict[str, float]:
         start = _now()
         pipeline.model.get_outputs_for_camera(camera)
         rendered = _now()
-        scene.relevancy_maps(to_rasterizer(camera), scorer.queries.to(pipeline.device))
+        scene.relevancy_maps(photo_camera(camera).camera(), scorer.queries.to(pipeline.device))
         times["render_ms"].append(1000 * (rendered - start))
         times["answer_ms"].append(1000 * (_now() - rendered))
     return {name: median(values) for name, values in times.items()}

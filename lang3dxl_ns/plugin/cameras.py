@@ -10,7 +10,7 @@ from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.scene.camera import Camera, Lens, view_matrix
+from lang3dxl_ns.scene.camera import Lens
 from lang3dxl_ns.training.state import PhotoCamera
 
 
@@ -38,18 +38,8 @@ def lens_of(cameras: Cameras, index: int) -> Lens:
     return Lens(int(cameras.width[index]), int(cameras.height[index]), fx, fy, cx, cy, distortion)
 
 
-def to_rasterizer(camera: Cameras, pose: Float[Tensor, "3 4"] | None = None) -> Camera:
-    """Convert a nerfstudio camera for the rasterizer, at its own or a refined pose (camera → world)."""
-    return Camera(
-        view_matrix=view_matrix(camera.camera_to_worlds[0] if pose is None else pose),
-        intrinsics=camera.get_intrinsics_matrices()[0],
-        width=int(camera.width.item()),
-        height=int(camera.height.item()),
-    )
-
-
 def photo_camera(camera: Cameras) -> PhotoCamera:
-    """Convert a nerfstudio camera for a training step."""
+    """Convert a nerfstudio camera for a training step, and for the rasterizer (`PhotoCamera.camera`)."""
     return PhotoCamera(
         camera.camera_to_worlds[0],
         camera.get_intrinsics_matrices()[0],

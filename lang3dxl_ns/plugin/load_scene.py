@@ -63,7 +63,7 @@ def load_run(
     assert isinstance(model, Lang3DXLModel)
     with readable(f"the checkpoint {path} does not fit the config.yml beside it", "copy both from one run"):
         model.load_state_dict(model_state(checkpoint["pipeline"]), strict=True)
-    if model.semantic_field is not None and model.carried is None:
+    if model.semantic_field is not None and model.run.carried is None:
         raise UserError(NOT_FINISHED)
     model.to(worker).eval()
     file = replace(file, clip=clip or file.clip)

@@ -23,9 +23,8 @@ from lang3dxl_ns.evaluation.score_run import Evaluation, EvaluationSettings
 from lang3dxl_ns.plugin.datamanager import Lang3DXLDataManager, Lang3DXLDataManagerConfig
 from lang3dxl_ns.plugin.dataparser import RecordedSceneDataParserConfig
 from lang3dxl_ns.plugin.load_scene import model_state
-from lang3dxl_ns.plugin.model import Lang3DXLModel, Lang3DXLModelConfig
+from lang3dxl_ns.plugin.model import Lang3DXLModel, Lang3DXLModelConfig, RenderedAnswers
 from lang3dxl_ns.plugin.panel import AskPanel
-from lang3dxl_ns.plugin.rendering_model import RenderedAnswers
 from lang3dxl_ns.scene.record import SCENE_FILE, SceneRecord
 from lang3dxl_ns.training.learn_codes import learn_words
 
