@@ -5,14 +5,13 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, TypeAlias
 
 import torch
 from jaxtyping import Float
-from numpy import ndarray as Array
 from torch import Tensor
 
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.query.answering import Answering, Place
 from lang3dxl_ns.query.match import Found, Match
 from lang3dxl_ns.query.negatives import CLEAR, NOTHING
 from lang3dxl_ns.query.question import Question
@@ -21,14 +20,8 @@ from lang3dxl_ns.query.view_ranking import Viewpoint, rank_views, strongest_matc
 from lang3dxl_ns.rendering import composite
 from lang3dxl_ns.scene.camera import Camera, resized
 
-if TYPE_CHECKING:
-    from lang3dxl_ns.query.scene import Scene
 
-Place: TypeAlias = Camera | str | Float[Tensor, "rows 4"] | Float[Array, "rows 4"]
-"""A camera, a photo's name, or a pose (camera → world in the model's frame, nerfstudio's axes)."""
-
-
-def matches(scene: Scene, question: Question, place: Place, size: int | None = None) -> list[Match]:
+def matches(scene: Answering, question: Question, place: Place, size: int | None = None) -> list[Match]:
     """Find matches of a question's prompts in one view; see `Scene.query`.
 
     Relevancies are composited with at most as many pixels as the training photos have, and enlarged for a
@@ -56,7 +49,7 @@ def matches(scene: Scene, question: Question, place: Place, size: int | None = N
     ]
 
 
-def best_matches(scene: Scene, question: Question, size: int | None = None) -> list[Match]:
+def best_matches(scene: Answering, question: Question, size: int | None = None) -> list[Match]:
     """Find each prompt's match in the training view that shows it best. Raises UserError if the scene has no
     training photos."""
     names = best_views(scene, question)
@@ -64,7 +57,7 @@ def best_matches(scene: Scene, question: Question, size: int | None = None) -> l
     return [matches(scene, q, name, size)[0] for q, name in zip(questions, names, strict=True)]
 
 
-def locate(scene: Scene, question: Question, most: int = 10) -> list[Found]:
+def locate(scene: Answering, question: Question, most: int = 10) -> list[Found]:
     """Find matches of a question's prompts in the scene, with at most `most` views each."""
     found = []
     for row, prompt in enumerate(question.prompts):
@@ -78,27 +71,27 @@ def locate(scene: Scene, question: Question, most: int = 10) -> list[Found]:
     return found
 
 
-def ranked_views(scene: Scene, question: Question, row: int) -> list[Viewpoint]:
+def ranked_views(scene: Answering, question: Question, row: int) -> list[Viewpoint]:
     """Return all training views, those that show the prompt of this row first, best first."""
     ranks = rank_views(scene.visible, scene.splats.means, question.relevancy[row], question.thresholds[row])
     return [replace(view, camera=scene.file.photo(view.name).camera) for view in ranks]
 
 
-def best_views(scene: Scene, question: Question) -> list[str]:
+def best_views(scene: Answering, question: Question) -> list[str]:
     """Return for each prompt the name of the training photo whose view shows it best, or comes closest.
     Raises UserError if the scene has no training photos."""
     check_views(scene)
     return [ranked_views(scene, question, row)[0].name for row in range(len(question.prompts))]
 
 
-def check_views(scene: Scene) -> None:
+def check_views(scene: Answering) -> None:
     """Raise UserError if the scene has no training photos."""
     if not scene.visible:
         raise UserError("this scene has no training photos to choose from: name a photo or a camera")
 
 
 @torch.no_grad()
-def relevancy_maps(scene: Scene, camera: Camera, queries: Queries) -> Float[Tensor, "q h w"]:
+def relevancy_maps(scene: Answering, camera: Camera, queries: Queries) -> Float[Tensor, "q h w"]:
     """Compute every pixel's relevancy to every query, 0…1, as it is scored, without a foreground."""
     rendering = scene.draw(camera, scene.engine.channels(queries))
     assert rendering.channels is not None
@@ -106,7 +99,7 @@ def relevancy_maps(scene: Scene, camera: Camera, queries: Queries) -> Float[Tens
 
 
 def words_at(
-    scene: Scene, camera: Camera, x: float, y: float, words: Sequence[str], most: int
+    scene: Answering, camera: Camera, x: float, y: float, words: Sequence[str], most: int
 ) -> list[tuple[str, float]]:
     """Find the words that match a camera's pixel best, with their relevancy; see `Scene.what_is`."""
     if not (0 <= x < camera.width and 0 <= y < camera.height):

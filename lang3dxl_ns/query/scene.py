@@ -25,7 +25,7 @@ from lang3dxl_ns.files.matching_splat import write_matching
 from lang3dxl_ns.files.splat_file import write_splats
 from lang3dxl_ns.preparation.encoders import load_image_text_encoder
 from lang3dxl_ns.query import answer
-from lang3dxl_ns.query.answer import Place
+from lang3dxl_ns.query.answering import Place
 from lang3dxl_ns.query.doubt import DOUBTFUL, Doubts, doubtful, peaks
 from lang3dxl_ns.query.engine import QueryEngine, make_engine
 from lang3dxl_ns.query.floaters import FLOATS, floating

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import torch
 from jaxtyping import Bool
@@ -14,17 +13,15 @@ from torch import Tensor
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.query.answer import check_views
+from lang3dxl_ns.query.answering import Answering
 from lang3dxl_ns.query.text import taught_prompt
 from lang3dxl_ns.scene.record import same_clip
 from lang3dxl_ns.words.learn_word import Weights, learn
 from lang3dxl_ns.words.taught_words import Example, TaughtWord, known_word
 
-if TYPE_CHECKING:
-    from lang3dxl_ns.query.scene import Scene
-
 
 def learned_word(
-    scene: Scene, word: str, examples: Sequence[Example], selection: Bool[Tensor, " n"] | None = None
+    scene: Answering, word: str, examples: Sequence[Example], selection: Bool[Tensor, " n"] | None = None
 ) -> TaughtWord:
     """Learn a word from marks in a scene's photos; see `Scene.teach`."""
     prompt = taught_prompt(word)
@@ -42,7 +39,7 @@ def learned_word(
     return replace(learned, clip=scene.file.clip_identity, scene=Path(scene.file.data).name)
 
 
-def carried_word(scene: Scene, word: TaughtWord) -> TaughtWord:
+def carried_word(scene: Answering, word: TaughtWord) -> TaughtWord:
     """Adapt a word that was taught elsewhere to a scene; see `Scene.carrying`."""
     sizes = {photo.name: photo.file_size for photo in scene.photos}
     marked = [e for e in word.examples if e.photo in sizes and e.size in (None, sizes[e.photo])]
@@ -56,7 +53,7 @@ def carried_word(scene: Scene, word: TaughtWord) -> TaughtWord:
     return replace(word, examples=(), precision={})
 
 
-def least_certain_photo(scene: Scene, word: str) -> str:
+def least_certain_photo(scene: Answering, word: str) -> str:
     """Find the training photo in which a taught word is least certain; see `Scene.unsure`."""
     taught = scene.words.get(known_word(word))
     if taught is None:

@@ -1,0 +1,67 @@
+"""What answers need of a scene: the part of `Scene` that modules below it may use."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Protocol, TypeAlias
+
+import torch
+from jaxtyping import Float
+from numpy import ndarray as Array
+from torch import Tensor
+
+from lang3dxl_ns.components.appearance import Look
+from lang3dxl_ns.components.feature_decoder import Decoder
+from lang3dxl_ns.query.engine import QueryEngine
+from lang3dxl_ns.query.match import View
+from lang3dxl_ns.query.question import QueryConfig, Question
+from lang3dxl_ns.query.text import Prompt, TextEncoder
+from lang3dxl_ns.query.visibility import VisibleGaussians
+from lang3dxl_ns.rendering import Rendering, Splats
+from lang3dxl_ns.scene.camera import Camera
+from lang3dxl_ns.scene.record import ScenePhoto, SceneRecord
+from lang3dxl_ns.words.taught_words import TaughtWord
+
+Place: TypeAlias = Camera | str | Float[Tensor, "rows 4"] | Float[Array, "rows 4"]
+"""A camera, a photo's name, or a pose (camera → world in the model's frame, nerfstudio's axes)."""
+
+
+class Answering(Protocol):
+    """A scene that can be asked. `Scene` describes its members."""
+
+    splats: Splats
+    file: SceneRecord
+    words: Mapping[str, TaughtWord]
+    config: QueryConfig
+
+    @property
+    def device(self) -> torch.device: ...
+    @property
+    def photos(self) -> list[ScenePhoto]: ...
+    @property
+    def visible(self) -> Mapping[str, VisibleGaussians]: ...
+    @property
+    def mass(self) -> Float[Tensor, " n"]: ...
+    @property
+    def gap(self) -> float: ...
+    @property
+    def trained_side(self) -> int: ...
+    @property
+    def engine(self) -> QueryEngine: ...
+    @property
+    def text(self) -> TextEncoder: ...
+    def semantics(self) -> tuple[Decoder, Float[Tensor, "n d"]]: ...
+    def camera(self, place: Place, size: int | None = None) -> Camera: ...
+    def draw(
+        self, camera: Camera, channels: Float[Tensor, "n d"] | None = None, look: Look | None = None
+    ) -> Rendering: ...
+    def view(
+        self,
+        place: Place,
+        camera: Camera,
+        look: str | None = None,
+        channels: Float[Tensor, "n d"] | None = None,
+    ) -> View: ...
+    def fill(self, camera: Camera, weight: Float[Tensor, "h w"]) -> Float[Tensor, " n"]: ...
+    def ask(self, texts: str) -> Question: ...
+    def synonyms(self, prompt: Prompt) -> list[str]: ...
