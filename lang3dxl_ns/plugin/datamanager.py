@@ -35,7 +35,7 @@ from lang3dxl_ns.plugin.photo_dataset import PhotoDataset
 from lang3dxl_ns.preparation.needs import needs_table
 from lang3dxl_ns.preparation.settings import PreparationConfig
 from lang3dxl_ns.preparation.store import FeatureStore
-from lang3dxl_ns.preparation.targets import Batch, SceneFacts
+from lang3dxl_ns.preparation.targets import FACTS, Batch, SceneFacts
 from lang3dxl_ns.preparation.working_photos import WorkingPhotos
 from lang3dxl_ns.scene.camera import LONGEST_SIDE
 from lang3dxl_ns.scene.capture import Capture
@@ -142,7 +142,7 @@ class Lang3DXLDataManager(FullImageDatamanager):
         )  # fmt: skip
         dataset = self._dataset(self.train_dataparser_outputs, capture.split.train)
         positions = dataset.cameras.camera_to_worlds[..., 3]
-        SceneFacts(list(capture.split.train), positions).into(dataset.metadata)
+        dataset.metadata[FACTS] = SceneFacts(list(capture.split.train), positions)
         return dataset
 
     def create_eval_dataset(self) -> PhotoDataset:
@@ -167,7 +167,7 @@ class Lang3DXLDataManager(FullImageDatamanager):
         """Prepare missing targets before training; give the model their statistics and the scene's needs."""
         if self.test_mode == "val":
             say(needs_table(self.data.needs))
-            self.data.facts().into(self.train_dataset.metadata)
+            self.train_dataset.metadata[FACTS] = self.data.facts()
 
     def sample_train_cameras(self) -> list[int]:
         """Return all training photos; `data` has their order."""

@@ -28,7 +28,7 @@ from lang3dxl_ns.plugin.cameras import photo_camera
 from lang3dxl_ns.plugin.conversation import Conversation
 from lang3dxl_ns.plugin.inert_settings import OF_SPLATFACTO
 from lang3dxl_ns.plugin.splatfacto import SplatfactoModel, SplatfactoModelConfig
-from lang3dxl_ns.preparation.targets import Batch, SceneFacts, foreground
+from lang3dxl_ns.preparation.targets import FACTS, Batch, SceneFacts, foreground
 from lang3dxl_ns.query.question import Question, pictures
 from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.rendering import Rendering
@@ -89,7 +89,8 @@ class Lang3DXLModel(SplatfactoModel):
     def populate_modules(self) -> None:
         """Build Gaussians, strategy, components and metrics (on the CPU; the pipeline moves them)."""
         self.config.fit_to_run(self.config.total_steps)
-        self.run = Training.begin(self.config, SceneFacts.of(self.kwargs["metadata"]), self.seed_points)
+        facts = self.kwargs["metadata"].get(FACTS) or SceneFacts()
+        self.run = Training.begin(self.config, facts, self.seed_points)
         self.gauss_params = self.run.gaussians
         self.adopt_parts()
         self.image_metrics = ImageMetrics()

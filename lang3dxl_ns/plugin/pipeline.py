@@ -121,11 +121,6 @@ class Lang3DXLPipeline(VanillaPipeline):
             scene = self.model.scene(self.scene_file, cache=cache)
             self.model.answers = RenderedAnswers(scene.ask(self.query))
 
-    @property
-    def has_words_to_learn(self) -> bool:
-        """Whether semantics are learned after the last iteration instead of from renderings."""
-        return self.model.run.learns_words_at_the_end
-
     def learn_words(self) -> None:
         """Gather the training photos' features onto the present Gaussians, and learn codes."""
         learn_words(self.model.run, self.datamanager.data.every_photo(), len(self.datamanager.train_dataset))

@@ -116,10 +116,7 @@ class Run:
                 self.schedulers[name] = schedule.scheduler(optimizer)
         self.state.optimizers = self.optimizers
         self.guard = StepGuard(settings.max_skipped_steps, say)
-        pixels = max(camera.width * camera.height for camera in self.data.cameras)
-        most, message = plan(self.state, pixels, torch.device(device), settings.scene.max_gaussians)
-        self.state.densification.most = most
-        say(message)
+        say(plan(self.state, self.data.cameras))
         torch.manual_seed(settings.seed)
 
     @property

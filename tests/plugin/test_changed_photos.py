@@ -91,7 +91,7 @@ def test_scenes_and_runs_record_the_cameras_that_training_refined(train, tmp_pat
         read_scene(trainer.base_dir / "scene.scene").file,
     ]
     for camera, batch in photos:
-        pose = model._pose(camera)
+        pose = model.run.pose(photo_camera(camera))
         assert not torch.allclose(pose, camera.camera_to_worlds[0], atol=1e-3)
         for file in recorded:
             known = torch.tensor(file.photo(batch["name"]).camera_to_world)

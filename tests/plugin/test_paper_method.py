@@ -179,6 +179,6 @@ def test_the_dense_loss_is_compared_at_its_target_and_sees_what_the_mask_leaves_
 
 
 def test_a_run_has_words_at_its_last_iteration_and_reads_as_this_method(trained):
-    assert not trained.pipeline.has_words_to_learn
+    assert not trained.pipeline.model.run.learns_words_at_the_end
     assert trained.base_dir.parent.name == "lang3dxl-paper"
     assert list(trained.base_dir.glob("*.scene"))
