@@ -50,7 +50,8 @@ def photo_camera(camera: Cameras) -> PhotoCamera:
 
 
 def to_cameras(view: PhotoCamera) -> Cameras:
-    """Convert a photo's camera to nerfstudio's, which a training step converts back (`photo_camera`)."""
+    """Convert a photo's camera to nerfstudio's, which a training step converts back (`photo_camera`). It
+    stays on the CPU, since the host reads its size and would wait for a GPU."""
     k = view.intrinsics[None]
     lens = k[:, 0, 0], k[:, 1, 1], k[:, 0, 2], k[:, 1, 2]
     camera = Cameras(view.pose[None], *lens, torch.tensor([view.width]), torch.tensor([view.height]))

@@ -10,7 +10,6 @@ import lab.baselines  # noqa: F401, which registers fmgs
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.methods import METHODS, lang3dxl_paper
 from lang3dxl_ns.plugin import trainer as trainer_module
-from lang3dxl_ns.plugin.optimizers import RunSchedule
 
 ITERATIONS = 70_000
 
@@ -27,7 +26,7 @@ def fitted():
 def rate(config, group, step):
     """Learning rate of a group at a step."""
     optimizer, scheduler = (config.optimizers[group][part] for part in ("optimizer", "scheduler"))
-    return optimizer.lr * (1.0 if scheduler is None else RunSchedule(scheduler).multiple(step))
+    return optimizer.lr * (1.0 if scheduler is None else scheduler.multiple(step))
 
 
 @pytest.mark.parametrize(
