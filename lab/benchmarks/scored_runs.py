@@ -182,7 +182,7 @@ def scene_labels(scenes: Sequence[Path]) -> dict[str, Path]:
 
 def run_configuration(run: Run, settings: RunSettings, work: Path) -> Lang3DXLTrainerConfig:
     """Build the configuration of a run, which goes on where an earlier attempt in the folder was stopped."""
-    from lang3dxl_ns.methods import run_config
+    from lab.runs import run_config
 
     names = settings.clip, settings.dense, run.row.method
     config = run_config(run.scene, work / "runs", run.label, run.steps, *names)
