@@ -15,14 +15,7 @@ from torch import Tensor
 
 from lang3dxl_ns.common.checks import expect
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.files.activations import (
-    ALL_BANDS,
-    activated,
-    array_of,
-    check_memory,
-    log_scales,
-    logits,
-)
+from lang3dxl_ns.files.activations import ALL_BANDS, activated, array_of, check_memory, log_scales, logits
 from lang3dxl_ns.rendering import Splats, harmonics_of
 
 _LONGEST_HEADER = 1 << 16
