@@ -22,7 +22,6 @@ from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.files.activations import ALL_BANDS, array_of, check_memory, tensor_of
 from lang3dxl_ns.rendering import Splats
 
-SUFFIX = ".glb"
 _SPLATS, _RECORD = "KHR_gaussian_splatting", "LANG3DXL_scene"
 _HEADER, _CHUNK = struct.Struct("<4sII"), struct.Struct("<I4s")
 _FLOAT, _POINTS, _ARRAY_BUFFER = 5126, 0, 34962
@@ -156,11 +155,8 @@ def read_glb(path: Path) -> Splats:
     return Splats(means, tensor_of(quats), scales, tensor_of(opacities), tensor_of(harmonics), antialiased)
 
 
-def scene_record(path: Path) -> bytes:
-    """Return the content of the scene file in a file. Raises UserError if there is none, and one of `DAMAGE`
-    for a damaged file."""
+def scene_record(path: Path) -> bytes | None:
+    """Read the scene file in a file; None if there is none. Raises one of `DAMAGE` for a damaged file."""
     file = _Glb(path)
     record = file.about.get("extensions", {}).get(_RECORD)
-    if record is None:
-        raise UserError("it holds splats without words; lang3dxl attach makes a scene of them")
-    return bytes(file.view(record["bufferView"]))
+    return None if record is None else bytes(file.view(record["bufferView"]))

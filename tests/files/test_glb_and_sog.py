@@ -1,5 +1,6 @@
-"""GLB and SOG: what is written is read back, as the formats say, and a GLB carries words."""
+"""GLB, SOG and SPZ: what is written is read back, as the formats say, and a GLB or SPZ carries words."""
 
+import gzip
 import io
 import json
 import struct
@@ -14,6 +15,7 @@ from PIL import Image
 from test_scene_file import decoded
 
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.files import spz
 from lang3dxl_ns.files.read_splats import read_splats
 from lang3dxl_ns.files.scene_file import keep_words, read_scene, write_scene
 from lang3dxl_ns.files.splat_file import write_splats
@@ -67,18 +69,51 @@ def test_a_glb_has_the_attributes_of_the_extension(tmp_path):
         np.testing.assert_allclose(values, wanted.flatten(), atol=1e-6)
 
 
-def test_a_glb_of_a_scene_answers_as_the_scene_does(tmp_path):
+@pytest.mark.parametrize("ending", ["glb", "spz"])
+def test_a_splat_that_carries_a_scene_answers_as_the_scene_does(ending, tmp_path):
     scene = painted_scene(**decoded("gathered"))
-    for name in ("a.scene", "a.glb"):
+    names = "a.scene", f"a.{ending}"
+    for name in names:
         write_scene(tmp_path / name, scene)
-    ours, other = (read_scene(tmp_path / name, encode_texts=encode_texts) for name in ("a.scene", "a.glb"))
+    ours, other = (read_scene(tmp_path / name, encode_texts=encode_texts) for name in names)
     np.testing.assert_array_equal(ours.relevancy("dome"), other.relevancy("dome"))
-    assert len(read_splats(tmp_path / "a.glb")) == len(scene.splats)
+    assert len(read_splats(tmp_path / names[1])) == len(scene.splats)
     with pytest.raises(UserError, match=r"--scene-file NAME.scene"):
-        keep_words(tmp_path / "a.glb", {})
-    write_splats(tmp_path / "b.glb", scene.splats)
+        keep_words(tmp_path / names[1], {})
+    write_splats(tmp_path / f"b.{ending}", scene.splats)
     with pytest.raises(UserError, match="without words"):
-        read_scene(tmp_path / "b.glb")
+        read_scene(tmp_path / f"b.{ending}")
+
+
+def test_an_spz_with_a_scene_is_an_spz_for_others_and_of_any_version_for_us(tmp_path):
+    gsply = pytest.importorskip("gsply")
+    scene = painted_scene(**decoded("gathered"))
+    path, plain = tmp_path / "a.spz", tmp_path / "b.spz"
+    write_scene(path, scene)
+    write_splats(plain, scene.baked())
+    np.testing.assert_array_equal(gsply.read_spz(path).means, gsply.read_spz(plain).means)
+    record = spz.scene_record(path)
+    gsply.write_spz(plain, gsply.read_spz(path), version=4)
+    content = bytearray(plain.read_bytes())
+    records = struct.pack("<III", 0xADBE0002, 4, 0) + struct.pack("<II", 0x4C330001, len(record)) + record
+    content[14] |= 2  # flags
+    content[16:20] = struct.pack("<I", 32 + len(records))
+    path.write_bytes(bytes(content[:32]) + records + bytes(content[32:]))
+    assert spz.scene_record(path) == record
+    torch.testing.assert_close(read_splats(path).means, read_splats(plain).means)
+    content[16:20] = struct.pack("<I", 32 + 12)
+    path.write_bytes(bytes(content[:32]) + records[:12] + bytes(content[32:]))
+    assert spz.scene_record(path) is None
+
+
+def test_a_small_spz_cannot_unpack_to_a_large_scene(tmp_path):
+    write_splats(tmp_path / "a.spz", some_splats(2))
+    content = bytearray(gzip.decompress((tmp_path / "a.spz").read_bytes()))
+    content[14] |= 2
+    bomb = bytes(content) + struct.pack("<II", 0x4C330001, 30_000_000) + bytes(30_000_000)
+    (tmp_path / "b.spz").write_bytes(gzip.compress(bomb))
+    with pytest.raises(UserError, match="unpacks to more"):
+        read_scene(tmp_path / "b.spz")
 
 
 def test_a_sog_is_read_back(tmp_path):
