@@ -170,9 +170,14 @@ def test_a_lighting_reaches_the_details(browser, tmp_path):  # noqa: F811
         tab.evaluate(HELD)
         before, after = (
             tab.evaluate(f"""async () => {{
+              const wait = () => new Promise((go) => setTimeout(go, 300)), {{ view }} = lang3dxl;
+              const light = view.light.bind(view);
+              let lit = false;
+              view.light = (...given) => (light(...given), (lit = true));
               document.getElementById("look").value = "{look}";
               document.getElementById("look").dispatchEvent(new Event("change"));
-              await new Promise((go) => setTimeout(go, 300));
+              do await wait(); while ("{look}" && !lit);
+              view.light = light;
               const mean = ({{ plain }}) => plain.reduce((a, b) => a + b, 0) / plain.length;
               return [...lang3dxl.view.parts.values()].map(mean);
             }}""")

@@ -11,7 +11,7 @@ import pytest
 import torch
 from painted_scene import CHANNELS, encode_texts, painted_file, painted_scene
 from PIL import Image
-from test_web_page import DESK, SIDE, browser, opened, rest, served  # noqa: F401
+from test_web_page import DESK, SIDE, browser, opened, rest, served, until, until_linked, until_told  # noqa: F401
 
 from lab.baselines.lifting import LiftedFeatures
 from lang3dxl_ns.common.errors import UserError
@@ -170,7 +170,7 @@ def test_a_photo_lies_exactly_over_the_rendering_and_leaves_with_the_eye(browser
         clip = page.evaluate("document.getElementById('photo').style.clipPath")
         shown = place["width"] - float(clip.split()[1].removesuffix("px"))
         assert shown + place["x"] - corner["x"] == pytest.approx(0.25 * corner["width"], abs=1)
-        assert f"photo={ALL.replace('/', '%2F')}" in page.url
+        until_linked(page, f"photo={ALL.replace('/', '%2F')}")
         page.evaluate("lang3dxl.view.mover.free = true")
         page.locator("#frame").press("ArrowLeft")
         page.locator("#over").wait_for(state="hidden")
@@ -203,22 +203,12 @@ def test_a_word_taught_in_the_page_is_in_the_scenes_file_and_in_the_page(browser
         page.get_by_role("button", name="Not this").click()
         page.mouse.click(*spot(page, scene, -0.8, -0.8))
         page.get_by_text("2 examples").wait_for()
-        for _ in range(100):
-            page.wait_for_timeout(100)
-            if in_file(file)["cupola of mine"]["examples"] != word["examples"]:
-                break
+        until(page, lambda: in_file(file)["cupola of mine"]["examples"] != word["examples"])
         page.get_by_role("button", name="Undo").click()
-        for _ in range(100):
-            page.wait_for_timeout(100)
-            if in_file(file)["cupola of mine"] == word:
-                break
-        assert in_file(file)["cupola of mine"] == word
+        until(page, lambda: in_file(file)["cupola of mine"], word)
         page.get_by_role("button", name="Forget").click()
-        for _ in range(100):
-            page.wait_for_timeout(100)
-            if not in_file(file):
-                break
-        assert in_file(file) == {} and page.complaints == []
+        until(page, lambda: in_file(file), {})
+        assert page.complaints == []
         page.close()
 
 
@@ -239,7 +229,7 @@ def test_a_name_that_is_half_typed_stays_when_an_answer_arrives(browser, file, t
         named = "lang3dxl.prompts.filter(({ examples }) => examples).map(({ text }) => text)"
         assert page.evaluate(named) == ["like this 1"]  # it isn't done yet
         page.keyboard.press("Enter")
-        assert page.evaluate(named) == ["gizmo"]
+        until(page, named, ["gizmo"])
         page.close()
 
 
@@ -266,6 +256,7 @@ def test_a_static_page_writes_words_that_the_scene_learns_as_if_marked_there(bro
         name.press("Enter")
         with page.expect_download() as saved:
             page.get_by_role("button", name="Save").click()
+        until_linked(page, "like=gizmo")
         link = page.url
         (word,) = load_words(saved.value.path())
         (example,) = word.examples
@@ -277,13 +268,15 @@ def test_a_static_page_writes_words_that_the_scene_learns_as_if_marked_there(bro
         page.reload()
         page.evaluate("lang3dxl.ready.then(() => true)")
         told = "lang3dxl.prompts.map(({ text, matching }) => [text, matching])"
+        until(page, "lang3dxl.prompts.length", 1)
         shown = page.evaluate(told)
         page.evaluate("lang3dxl.clear()")
         assert page.evaluate("lang3dxl.ask('gizmo')")["matching"] == shown[0][1]
         other = browser.new_context().new_page()  # without what this browser keeps
         other.goto(link)
         other.evaluate("lang3dxl.ready.then(() => true)")
-        assert other.evaluate(told) == shown and shown[0][0] == "gizmo"
+        until(other, told, shown)
+        assert shown[0][0] == "gizmo"
         other.close()
         page.close()
 
@@ -326,9 +319,10 @@ def test_a_misspelled_word_is_offered_where_the_answer_is_not_sure(browser, file
     with live(file) as server:
         page = opened(browser, address_of(server), DESK)
         page.evaluate("lang3dxl.ask('windwos')")
-        assert "Did you mean windows?" in page.locator("#near").inner_text()
+        until_told(page, "#near", "Did you mean windows?")
         page.locator("#near").get_by_role("button", name="windows", exact=True).click()
         page.locator("#prompts strong", has_text="windows").wait_for()
-        assert page.locator("#prompts strong").all_inner_texts() == ["windows"]
-        assert page.locator("#near").inner_text() == "" and page.complaints == []
+        until(page, "lang3dxl.prompts.map(({ text }) => text).join()", "windows")
+        until(page, "document.getElementById('near').textContent", "")
+        assert page.complaints == []
         page.close()

@@ -5,16 +5,17 @@ from dataclasses import replace
 
 import numpy as np
 from painted_scene import painted_file, painted_scene
-from test_web_page import DESK, browser, opened, served  # noqa: F401
+from test_web_page import DESK, browser, opened, served, until_linked, until_told  # noqa: F401
 
 from lang3dxl_ns.scene.georeference import Georeference
 from lang3dxl_ns.web.write_page import Page, write_page
 
 CLICK = """async ([x, y]) => {
-  const [column, row] = lang3dxl.view.pixel([x, y, 0]);
+  const [column, row] = lang3dxl.view.pixel([x, y, 0]), status = document.getElementById("status");
+  status.textContent = "";
   lang3dxl.view.dispatchEvent(new CustomEvent("click", { detail: { x: column, y: row } }));
-  await new Promise((go) => setTimeout(go, 300));
-  return document.getElementById("status").textContent;
+  while (!status.textContent) await new Promise((go) => setTimeout(go, 50));
+  return status.textContent;
 }"""
 
 
@@ -46,10 +47,8 @@ SCALE = """() => {
 }"""
 
 FRAMES = """async () => {
-  for (let k = 0; k < 100; k++) {
-    await new Promise((go) => setTimeout(go, 50));
-    if (lang3dxl.view.resting) return;
-  }
+  do await new Promise((go) => setTimeout(go, 50));
+  while (!lang3dxl.view.resting);
 }"""
 
 
@@ -64,7 +63,8 @@ def test_a_typed_length_sets_the_scale_and_travels_in_the_link(browser, tmp_path
         units = float(tab.evaluate(CLICK, [0.6, 0.5]).split()[0])
         tab.fill("#length", "30,0")
         tab.press("#length", "Enter")
-        assert tab.evaluate("document.getElementById('status').textContent").startswith("30 m apart")
+        until_told(tab, "#status", "30 m apart")
+        until_linked(tab, "unit=")
         link = tab.evaluate("location.href")
         tab.close()
         tab = opened(browser, link, DESK)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from painted_scene import painted_scene
-from test_web_page import DESK, browser, opened, rest, served  # noqa: F401 — browser is a fixture
+from test_web_page import DESK, browser, opened, served, until, until_linked  # noqa: F401 — browser is a fixture
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.things.find import Things
@@ -155,26 +155,23 @@ def test_a_word_lists_its_things_and_one_can_be_chosen_hidden_and_linked(page):
     summary.wait_for()
     assert summary.inner_text().startswith("2")
     summary.click()
-    chips = page.locator("#prompts ol button")
-    assert chips.count() == 2
-    assert page.locator("#boxes path.thing").count() == 2
+    until(page, "document.querySelectorAll('#prompts ol button').length", 2)
+    until(page, "document.querySelectorAll('#boxes path.thing').length", 2)
     page.evaluate("document.body.dispatchEvent(new KeyboardEvent('keydown', { key: ']', bubbles: true }))")
-    rest(page)
-    assert chips.nth(0).get_attribute("aria-pressed") == "true"
+    page.locator("#prompts ol li:first-child button[aria-pressed=true]").wait_for()
     page.get_by_role("button", name="Hide the rest").click()
+    until(page, "lang3dxl.view.only !== null")
     shown = page.evaluate("lang3dxl.view.only.size")
     assert 0 < shown < page.evaluate("lang3dxl.view.root.count")
-    rest(page)
-    page.wait_for_timeout(400)
+    until_linked(page, "thing=")
+    until_linked(page, "alone=1")
     address = page.evaluate("location.hash")
-    assert "thing=" in address
-    assert "alone=1" in address
     page.locator("body").press("Escape")
-    assert page.evaluate("lang3dxl.view.only") is None
+    until(page, "lang3dxl.view.only", None)
     page.evaluate("lang3dxl.clear()")
     page.evaluate("(hash) => { location.hash = hash; }", address)
     page.locator("#prompts ol button[aria-pressed=true]").wait_for()
-    assert page.evaluate("lang3dxl.view.only.size") == shown
+    until(page, "lang3dxl.view.only?.size", shown)
     page.evaluate("lang3dxl.clear()")
 
 
@@ -183,8 +180,8 @@ def test_questions_typed_into_the_page_are_answered_or_refused(page):
     assert told.startswith("2") and "windows" in told
     told = page.evaluate("lang3dxl.ask('leftmost window').then(({ told }) => told)")
     assert told.startswith("window ")
-    assert page.locator("#prompts ol button[aria-pressed=true]").count() == 1
+    until(page, "document.querySelectorAll('#prompts ol button[aria-pressed=true]').length", 1)
     refused = "lang3dxl.ask('how many windows near the dome').catch((error) => error.message)"
     assert "near" in page.evaluate(refused)
     page.evaluate("lang3dxl.clear()")
-    assert page.evaluate("lang3dxl.view.only") is None
+    until(page, "lang3dxl.view.only", None)

@@ -2,8 +2,8 @@
 
 import pytest
 from painted_scene import painted_scene
-from test_visits import until, visit
-from test_web_page import DESK, browser, prompts_of, served  # noqa: F401
+from test_visits import visit
+from test_web_page import DESK, browser, served, until  # noqa: F401
 
 from lang3dxl_ns.web.write_page import Page, write_page
 
@@ -41,13 +41,16 @@ def test_kept_views_travel_in_the_link_and_play_in_order(browser, address):  # n
             page.click("#keep")
             page.keyboard.type(caption)
             page.keyboard.press("Tab")
+            until(page, "lang3dxl.tour.stops.length", len(stands))
+        until(page, "new URLSearchParams(location.hash.slice(1)).getAll('stop').length", len(STOPS))
         link = page.evaluate("location.href")
     assert stands[0] != stands[1]
     with visit(browser, link, DESK) as page:
-        assert prompts_of(page) == ["windows"] and page.evaluate("location.href") == link
+        until(page, "lang3dxl.prompts.map(({ text }) => text).join()", "windows")
+        until(page, "location.href", link)
         played = page.evaluate(PLAYED)
         assert played == [[*stop, stand] for stop, stand in zip(STOPS, stands, strict=True)]
-        assert page.evaluate("document.getElementById('caption').hidden")
+        until(page, "document.getElementById('caption').hidden")
         page.click("[aria-label='Remove stop 1']")
         page.go_back()
         until(page, "document.querySelectorAll('#stops li').length", 2)

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 import pytest
 from painted_scene import painted_scene
 from PIL import Image
-from test_web_page import PHONE, browser, prompts_of, served  # noqa: F401
+from test_web_page import PHONE, browser, prompts_of, served, until  # noqa: F401
 
 from lang3dxl_ns.web.write_page import Page, write_page
 
@@ -67,14 +67,6 @@ def visit(browser, address, size, script=None, **media):  # noqa: F811
     yield page
     context.close()
     assert complaints == []
-
-
-def until(page, question, answer=True):
-    for _ in range(100):
-        if (found := page.evaluate(question)) == answer:
-            return
-        page.wait_for_timeout(100)
-    raise AssertionError(f"{question} is {found!r}")
 
 
 def tab_to(page, name: str) -> None:
