@@ -225,10 +225,7 @@ def _text_report(
     return told | {"threshold": threshold, "folder": folder.name}
 
 
-@showing(
-    *("scene", "text", "not_", "out", "web", "scene_file", "title", "all"),
-    *("look", "settings"),
-)
+@showing(*("scene", "text", "not_", "out", "web", "scene_file", "title", "all"), *("look", "settings"))
 @dataclass(kw_only=True)
 class Export:
     """Write a scene in another form. --out writes a splat file of the Gaussians that match a text, in the

@@ -16,14 +16,7 @@ from torch import Tensor
 from lang3dxl_ns.common.checks import expect
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.ply_tables import Table, read_header, read_vertices
-from lang3dxl_ns.files.activations import (
-    ALL_BANDS,
-    activated,
-    array_of,
-    check_memory,
-    log_scales,
-    logits,
-)
+from lang3dxl_ns.files.activations import ALL_BANDS, activated, array_of, check_memory, log_scales, logits
 from lang3dxl_ns.rendering import Splats, harmonics_of
 
 _NEEDED = ("x", "y", "z", "opacity", "scale_0", "scale_1", "rot_0", "rot_1", "rot_2", "rot_3")
@@ -94,9 +87,9 @@ def of_gsply(data: Any) -> Splats:
     return activated(data.means, data.scales, data.quats, data.opacities, bands)
 
 
-def encode_ply(splats: Splats, relevancy: Float[Tensor, " n"] | None = None) -> bytes:
+def encode_ply(splats: Splats, relevancy: Float[Tensor, " n"] | None = None, comment: str = "") -> bytes:
     """Encode the layout of 3D Gaussian splatting, which ordinary splat viewers open, with the relevancy (0…1)
-    as a further column."""
+    as a further column, and a comment of one line."""
     harmonics, count = splats.harmonics, len(splats)
     blocks = {
         ("x", "y", "z"): splats.means,
@@ -113,6 +106,7 @@ def encode_ply(splats: Splats, relevancy: Float[Tensor, " n"] | None = None) -> 
     names = [name for group in blocks for name in group]
     header = ["ply", "format binary_little_endian 1.0"]
     header += ["comment SplatRenderMode: mip", "comment antialiased 1"] if splats.antialiased else []
+    header += [f"comment {comment}"] if comment else []
     header += [f"element vertex {count}", *(f"property float {name}" for name in names), "end_header", ""]
     table = np.concatenate([array_of(block) for block in blocks.values()], axis=1)
     return "\n".join(header).encode() + np.ascontiguousarray(table, dtype="<f4").tobytes()

@@ -48,8 +48,8 @@ from lang3dxl_ns.words.taught_words import TaughtWord, known_word, save_words, w
 
 Module = TypeVar("Module", bound=torch.nn.Module)
 SUFFIX = ".scene"
-_CARRIERS = {".glb": (glb.encode_glb, glb.scene_record), ".spz": (spz.encode_spz, spz.scene_record)}
-"""Writer and reader of the splat files that can carry a scene file."""
+_CARRIERS = {".glb": glb.scene_record, ".spz": spz.scene_record}
+"""Readers of the scene file that a splat file can carry."""
 VERSION = 1
 _KEY = "lang3dxl"
 _MASK_SIDE = 800
@@ -137,10 +137,21 @@ def write_scene(path: Path, scene: Scene, provenance: Provenance | None = None) 
     described["scene"] = asdict(replace(scene.file, photos=photos, data=Path(scene.file.data).name))
     data = save(content, {_KEY: json.dumps(described, separators=(",", ":"))})
     if path.suffix in _CARRIERS:
-        baked = scene.baked()
-        data = _CARRIERS[path.suffix][0](baked.select(baked.sound()), data)
+        data = _carried(path.suffix, scene, data)
     write_atomically(path, data)
     return len(data)
+
+
+def _carried(kind: str, scene: Scene, record: bytes) -> bytes:
+    """Encode a scene's splats with its file inside."""
+    splats = scene.baked()
+    if kind == ".spz":
+        return spz.encode_spz(splats.select(splats.sound()), record)
+    codes = scene.codes
+    if codes is not None:
+        bounded = scene.decoder is not None and scene.decoder.bounded
+        codes = (codes.sigmoid() if bounded else codes).nan_to_num()
+    return glb.encode_glb(splats, record, codes, place=scene.file.georeference)
 
 
 def keep_words(path: Path, words: Mapping[str, TaughtWord | None]) -> None:
@@ -190,10 +201,9 @@ def _with_words_of(scene: Scene, earlier: Path, replaced: Path) -> Scene:
         name, new = known_word(word.name), scene.words.get(known_word(word.name))
         if new is not None:
             if earlier == replaced and new.lacks_examples_of(word):
-                names = (
-                    f"{earlier.stem}.{slugs([name])[0]}{number}.json" for number in ("", *range(2, 1000))
-                )
-                backup = next(path for each in names if not (path := earlier.with_name(each)).exists())
+                backup = earlier.with_name(f"{earlier.stem}.{slugs([name])[0]}.json")
+                if backup.exists():
+                    set_aside(backup)
                 save_words(backup, [word])
                 say(f"The taught word {word.name!r} is replaced; with its examples it is kept in {backup}")
             continue
@@ -347,7 +357,7 @@ def _opened(path: Path) -> Iterator[_File]:
         with ExitStack() as stack:
             place = path
             if path.suffix in _CARRIERS:
-                if (record := _CARRIERS[path.suffix][1](path)) is None:
+                if (record := _CARRIERS[path.suffix](path)) is None:
                     raise UserError("it holds splats without words")
                 place = Path(stack.enter_context(TemporaryDirectory())) / "record"
                 place.write_bytes(record)

@@ -124,8 +124,7 @@ class Capture:
             if not names:
                 raise UserError(
                     f"the {part} split of {self.folder} has no photo (of {len(self.photos)} in all): add "
-                    "photos, "
-                    "or choose another split with `lang3dxl-colmap --eval-mode …` after all options"
+                    "photos, or choose another split with `lang3dxl-colmap --eval-mode …` after all options"
                 )
         return Split(train, held_out)
 
