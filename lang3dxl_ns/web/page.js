@@ -156,8 +156,8 @@ function draw(newest = null) {
   const acts = { fly, remove, rename, dragThreshold, setThreshold, teach, outline, save, forget }, focused = document.activeElement;
   list.tidy();
   const [from, label] = [prompts.find(({ card }) => card?.contains(focused)), focused?.ariaLabel ?? focused?.textContent];
-  const typing = from && focused.matches("header input") && focused.value !== focused.defaultValue;
-  const caret = typing && [focused.selectionStart, focused.selectionEnd];
+  const naming = from && focused.matches("header input"), typing = naming && focused.value !== focused.defaultValue;
+  const selected = naming && [focused.selectionStart, focused.selectionEnd];
   for (const prompt of prompts) {
     prompt.card = promptCard(prompt, acts, about);
     prompt.card.append(list.part(prompt) ?? "");
@@ -168,9 +168,9 @@ function draw(newest = null) {
   }
   $("prompts").replaceChildren(...prompts.map(({ card }) => card));
   [...(from?.card.querySelectorAll("button, input, summary") ?? [])].find((one) => (one.ariaLabel ?? one.textContent) === label)?.focus();
-  if (typing) {
+  if (naming) {
     focused.kept = false;
-    focused.setSelectionRange(...caret);
+    from.card.querySelector("header input").setSelectionRange(...selected);
   }
   $("try").hidden = prompts.length > 0;
   view.recolor(prompts.filter((prompt) => prompt.relevancy));
