@@ -239,7 +239,7 @@ class Export:
     photos: Path | None = None
     """Folder of the scene's photos, of which the page shows small copies (default: none are published)."""
     scene_file: Path | None = None
-    """Scene file to write, NAME.scene, or NAME.glb, which viewers of glTF show too."""
+    """Scene file to write, NAME.scene, or NAME.glb or NAME.spz, which splat viewers show too."""
     title: str = ""
     """Title of page and scene (default: the scene's own, or the name of the photos' folder)."""
     credit: str = ""

@@ -21,8 +21,7 @@ from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import expanded
 from lang3dxl_ns.components.appearance import AppearanceField, Look, render_in_look
 from lang3dxl_ns.components.feature_decoder import Decoder
-from lang3dxl_ns.files.matching_splat import write_matching
-from lang3dxl_ns.files.splat_file import write_splats
+from lang3dxl_ns.files.splat_file import write_matching, write_splats
 from lang3dxl_ns.preparation.encoders import load_image_text_encoder
 from lang3dxl_ns.query import answer
 from lang3dxl_ns.query.answering import Place
@@ -379,13 +378,11 @@ class Scene:
             UserError: nothing matches, or see `ask` and `write_splats`.
         """
         splats = self.baked(look)
-        solid = self.floating <= FLOATS if hide_floaters else self.splats.opacities >= 0
+        path, place = expanded(path), self.file.georeference
+        solid = self.floating <= FLOATS if hide_floaters else None
         if text is None:
-            return write_splats(expanded(path), splats.select(solid) if hide_floaters else splats)
-        question = self._one(text, threshold)
-        return write_matching(
-            expanded(path), splats, question, everything, index, solid if hide_floaters else None
-        )
+            return write_splats(path, splats if solid is None else splats.select(solid), place=place)
+        return write_matching(path, splats, self._one(text, threshold), everything, index, solid, place)
 
     # ── what the photos show ────────────────────────────────────────────────────────────────────────
 

@@ -81,7 +81,7 @@ export function sureOf(things) {
   return things.filter(({ views }) => views > Math.max(VIEWS, typical / 2));
 }
 
-/** How many there are, such as "34, perhaps 31 to 37". */
+/** How many there are, such as "34, perhaps 31 to 37". after: a text behind the number. */
 export function count({ things, candidates }, after = "") {
   const least = sureOf(things).length, most = things.length + candidates.length;
   return things.length + after + (least === most ? "" : `, perhaps ${least} to ${most}`);
