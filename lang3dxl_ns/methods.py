@@ -14,6 +14,7 @@ from lang3dxl_ns.plugin.optimizers import parameter_groups
 from lang3dxl_ns.plugin.pipeline import Lang3DXLPipelineConfig
 from lang3dxl_ns.plugin.run_settings import check_command_line
 from lang3dxl_ns.plugin.trainer_config import Lang3DXLTrainerConfig
+from lang3dxl_ns.plugin.wrong_flags import name_wrong_flags
 from lang3dxl_ns.training.learning_rates import Rates, learning_rates, printed_learning_rates
 from lang3dxl_ns.training.settings import PRINTED_PHOTO_SCALE, as_printed
 
@@ -60,3 +61,4 @@ lang3dxl_paper = MethodSpecification(
 METHODS = {"lang3dxl": lang3dxl, "lang3dxl-paper": lang3dxl_paper}
 if sys.argv[1:2] and sys.argv[1] in METHODS:
     sys.argv[2:] = asked_for_all(sys.argv[2:])
+    name_wrong_flags(METHODS[sys.argv[1]].config)

@@ -217,10 +217,7 @@ def _text_report(
     return told | {"threshold": threshold, "folder": folder.name}
 
 
-@showing(
-    *("scene", "text", "not_", "out", "web", "scene_file", "title", "all"),
-    *("look", "settings"),
-)
+@showing(*("scene", "text", "not_", "out", "web", "scene_file", "title", "all"), *("look", "settings"))
 @dataclass(kw_only=True)
 class Export:
     """Write a scene in another form. --out writes a splat file of the Gaussians that match a text, in the
@@ -242,7 +239,7 @@ class Export:
     photos: Path | None = None
     """Folder of the scene's photos, of which the page shows small copies (default: none are published)."""
     scene_file: Path | None = None
-    """Scene file to write, NAME.scene, or NAME.glb, which viewers of glTF show too."""
+    """Scene file to write, NAME.scene, or NAME.glb or NAME.spz, which splat viewers show too."""
     title: str = ""
     """Title of page and scene (default: the scene's own, or the name of the photos' folder)."""
     credit: str = ""

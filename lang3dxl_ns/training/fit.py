@@ -101,7 +101,7 @@ class Run:
             settings.photo_scale,
         )  # fmt: skip
         self.path = folder / f"{capture.folder.name or 'scene'}{SUFFIX}"
-        self.start, self.words_are_learned = 0, False
+        self.start, self.words_are_learned, self.title = 0, False, self.path.stem
         points, colors = map(torch.from_numpy, capture.seeds)
         facts = self.data.facts()
         say(needs_table(self.data.needs))
@@ -176,7 +176,7 @@ class Run:
         }
         save_checkpoint(self.folder / CHECKPOINT, state)
         told = f"{self.settings.method}, {step + 1} of {self.settings.steps} iterations"
-        return replace_scene(self.path, self.scene(), Provenance(title=self.path.stem, made_how=told))[0]
+        return replace_scene(self.path, self.scene(), Provenance(title=self.title, made_how=told))[0]
 
     def resume(self) -> None:
         """Go on where the folder's checkpoint ends, if there is one."""

@@ -1,14 +1,12 @@
 // The list of a word's things: how many were found, one after the other, their boxes, and questions about them.
 import { element, shown } from "./cards.js";
-import { answerTo, parse, wordsOf } from "./grammar.js";
+import { answerTo, count, parse, unsure, wordsOf } from "./grammar.js";
 import { Vector3 } from "./library.js";
 import { lengthAsText } from "./measure.js";
 
 const NAMESPACE = "http://www.w3.org/2000/svg", CORNERS = [0, 1, 2, 3, 4, 5, 6, 7];
 const FILLED = 0.35, NARROW = 15, WIDE = 60; // share of the window that a thing fills after a flight; degrees of the lens
 const GAP = 4, LETTER = 8, LINE = 18; // pixels between labels, per letter, and of a line
-
-const count = ({ things, least, most }) => (least === most ? `${things.length}` : `${things.length}, perhaps ${Math.min(least, things.length)} to ${Math.max(most, things.length)}`);
 
 export class List extends EventTarget {
   /** about: the page's description; think: gives the worker a job; view, prompts: what is shown. Fires `change` when
@@ -18,7 +16,7 @@ export class List extends EventTarget {
     Object.assign(this, { about, think, view, prompts, chosen: null, alone: false, wanted: null });
   }
 
-  /** Find a prompt's things, once for each of its answers; resolves to { things, least, most }. */
+  /** Find a prompt's things, once for each of its answers; resolves to { things, candidates }. */
   async find(prompt) {
     const { turn, relevancy } = prompt;
     if (prompt.counting?.turn !== turn) prompt.counting = { turn, found: this.think("things", { relevancy }) };
@@ -41,7 +39,7 @@ export class List extends EventTarget {
   part(prompt) {
     if (!prompt.found) return null;
     const { things } = prompt.found, small = (label, act, more) => element("button", { className: "small", onclick: act, ...more }, label);
-    const summary = element("summary", {}, things.length ? `${count(prompt.found)} found${this.about.detail ? " in the coarse scene" : ""}` : "No single things found");
+    const summary = element("summary", {}, things.length ? count(prompt.found, this.about.detail ? " found in the coarse scene" : " found") : "No single things found");
     const made = element("details", { className: "things", open: Boolean(prompt.listed) }, summary);
     summary.addEventListener("click", (event) => {
       event.preventDefault();
@@ -144,16 +142,17 @@ export class List extends EventTarget {
   /** Answer a question, such as "highest tower". ask: answers a prompt, and resolves to whether its words are known.
    * Resolves to the answer in words; null if some word is unknown. */
   async question(typed, ask) {
-    const request = parse(typed), words = wordsOf(request), things = {};
+    const request = parse(typed), words = wordsOf(request), found = {};
     for (const word of words) if (!(await ask(word))) return null;
     const asked = words.map((word) => this.prompts.find(({ text }) => text === word));
     if (!asked.every(Boolean)) return null;
-    for (const prompt of asked) things[prompt.text] = (await this.find(prompt)).things;
-    const chosen = answerTo(request, things, this.directions), [first] = asked, every = chosen.length === things[request.word].length;
+    for (const prompt of asked) found[prompt.text] = await this.find(prompt);
+    const things = Object.fromEntries(Object.entries(found).map(([word, one]) => [word, one.things]));
+    const view = this.directions, chosen = answerTo(request, things, view), [first] = asked, every = chosen.length === things[request.word].length;
     Object.assign(first, { listed: true, asked: every ? null : new Set(chosen.map(({ id }) => id)) });
     const sure = asked.every(({ trust }) => trust.level === "sure") ? "" : " Not sure: see the cards.";
-    const wide = request.count && every ? [] : asked.filter(({ found }) => found.least !== found.most); // as Python's unsure
-    const note = (wide.length ? ` Unsure, since ${wide.map(({ text, found }) => `${shown(text)}: ${count(found)}`).join(", ")}.` : "") + sure;
+    const doubt = request.count && every ? null : unsure(request, found, view, shown);
+    const note = (doubt ? ` Unsure, since ${doubt}.` : "") + sure;
     if (request.count) {
       this.dispatchEvent(new Event("change"));
       return `${every ? count(first.found) : chosen.length} ${shown(request.word)}.${note}`;
@@ -182,21 +181,30 @@ export class List extends EventTarget {
     return drawn.sort((a, b) => b.own - a.own || b.asked - a.asked).flatMap((one) => this.outline(one, taken));
   }
 
-  outline({ prompt, thing: { center, axes, size }, thing, label, own, asked }, taken) {
-    const corners = CORNERS.map((c) => this.view.pixel(center.map((value, k) => axes.reduce((sum, axis, a) => sum + axis[k] * size[a] * (((c >> a) & 1) - 0.5), value))));
+  /** Draw a thing's box, and its label where that covers none of those in `taken`. */
+  outline({ prompt, thing, label, own, asked }, taken) {
+    const corners = cornersOf(thing).map((corner) => this.view.pixel(corner));
     if (!corners.every(Boolean)) return [];
-    const edges = CORNERS.flatMap((k) => [1, 2, 4].filter((step) => !(k & step)).map((step) => `M${corners[k]}L${corners[k + step]}`));
-    const path = document.createElementNS(NAMESPACE, "path"), text = document.createElementNS(NAMESPACE, "text");
-    path.setAttribute("d", edges.join(""));
+    const kind = `thing ${own ? "chosen" : asked ? "" : "aside"}`, edges = CORNERS.flatMap((k) => [1, 2, 4].filter((step) => !(k & step)).map((step) => `M${corners[k]}L${corners[k + step]}`));
+    const path = drawn("path", prompt.color, { class: kind, d: edges.join("") });
     const [x, y] = corners.reduce((best, corner) => (corner[1] < best[1] ? corner : best)), word = own ? `${shown(prompt.text)} ${label}` : label;
     const half = (LETTER * word.length) / 2, place = [x - half, y - 6 - LINE, x + half, y - 6];
-    const free = taken.every((other) => place[0] > other[2] + GAP || other[0] > place[2] + GAP || place[1] > other[3] + GAP || other[1] > place[3] + GAP);
-    for (const part of [path, text]) part.style.setProperty("--color", `rgb(${prompt.color})`), part.classList.add("thing", ...(own ? ["chosen"] : asked ? [] : ["aside"])); // prettier-ignore
-    if (!free) return [path];
+    const apart = (other) => place[0] > other[2] + GAP || other[0] > place[2] + GAP || place[1] > other[3] + GAP || other[1] > place[3] + GAP;
+    if (!taken.every(apart)) return [path];
     taken.push(place);
-    [["x", x], ["y", y - 6]].forEach(([name, value]) => text.setAttribute(name, value));
+    const text = drawn("text", prompt.color, { class: kind, x, y: y - 6 });
     text.textContent = word;
     text.addEventListener("click", () => this.choose(prompt, thing));
     return [path, text];
   }
+}
+
+const cornersOf = ({ center, axes, size }) =>
+  CORNERS.map((c) => center.map((value, k) => axes.reduce((sum, axis, a) => sum + axis[k] * size[a] * (((c >> a) & 1) - 0.5), value)));
+
+function drawn(tag, color, attributes) {
+  const made = document.createElementNS(NAMESPACE, tag);
+  for (const [name, value] of Object.entries(attributes)) made.setAttribute(name, value);
+  made.style.setProperty("--color", `rgb(${color})`);
+  return made;
 }

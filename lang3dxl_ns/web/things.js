@@ -1,22 +1,24 @@
 // Single things out of a word's relevancy, as in Python's things/: pieces of each view, joined by shared Gaussians.
 // Python renders the heat that is cut into pieces; here it is drawn from the pixels that each Gaussian fills.
 import language from "./language.js";
+import { fitted } from "./like.js";
 
-const { LEVELS, PART, DEPTH, FILLED, SHARED, SPLINTER, VIEWS, CRUMB, OFTEN, MOST_SHARED, OUTLIERS, TURNS, COLORED, SAME } = language.things;
+const { LEVELS, PART, DEPTH, FILLED, SHARED, SPLINTER, VIEWS, CRUMB, OFTEN, MOST_SHARED, OUTLIERS, TURNS, COLORED, SAME, SLIM, STRAIGHT } = language.things;
 const SIDE = 240, LEAST = 3; // pixels of a view's longer side, and of the smallest piece
 const FAINT = 0.05, TRACE = 0.004, REACH = 2.5, BLUR = 0.3; // relevancy and heat that leave no trace, standard deviations that are drawn, square pixels
-const SHARP = 10, ROUNDS = 12; // inverse strength of the colors' regularization, Newton steps
+const RIDGE = 0.1, ROUNDS = 12; // strength of the colors' regularization, Newton steps
 const DC = 0.28209479177387814; // of spherical harmonics: colors are compared as coefficients
 
-/** Find the things of a word: { things, least, most }, largest first. views: as of find.js; scene: { centers, axes,
+/** Find the things of a word: { things, candidates }, each largest first. views: as of find.js; scene: { centers, axes,
  * bytes (packed splats), mass, gap, up }, in one frame. */
 export function thingsOf(views, scene, relevancy) {
   const heat = sharpened(scene, relevancy), { mass } = scene;
   const weight = Float64Array.from(relevancy, (value, i) => Math.sqrt(mass[i]) * value);
-  const candidates = join(views.flatMap((view, v) => piecesOf(drawn(view, scene, heat), v)), weight);
-  const joined = withoutCrumbs(candidates), sure = joined.filter((one) => photosOf(one).size >= VIEWS);
-  const things = sure.map((one) => described(one, scene, weight, relevancy)).sort((a, b) => b.weight - a.weight);
-  return { things, least: joined.filter((one) => photosOf(one).size > VIEWS).length, most: candidates.length };
+  const parts = join(views.flatMap((view, v) => piecesOf(drawn(view, scene, heat), v)), weight);
+  const joined = stacked(parts, parts.map(({ rows }) => uprightBox(rows, scene.centers, weight, scene.up)));
+  const sure = new Set(withoutCrumbs(joined).filter((one) => photosOf(one).size >= VIEWS));
+  const listed = (some) => some.map((one) => described(one, scene, weight, relevancy)).sort((a, b) => b.weight - a.weight);
+  return { things: listed([...sure]), candidates: listed(joined.filter((one) => !sure.has(one))) };
 }
 
 /** Return whether a word's peak reaches the lowest level: one that stays below names nothing here. */
@@ -54,7 +56,7 @@ function described({ rows, weight, votes }, { centers, mass, up }, weights, rele
   const best = new Map();
   for (const piece of [...votes].sort((a, b) => a.cut - b.cut || b.area - a.area)) if (!best.has(piece.view)) best.set(piece.view, piece.box);
   const seen = [...best].map(([view, box]) => ({ view, box }));
-  return { id, weight, score: sum / heavy, rows: Uint32Array.from(rows).sort(), seen, ...uprightBox(rows, centers, weights, up) };
+  return { id, weight, views: seen.length, score: sum / heavy, rows: Uint32Array.from(rows).sort(), seen, ...uprightBox(rows, centers, weights, up) };
 }
 
 // ── heat ──
@@ -71,9 +73,9 @@ export function sharpened({ centers, bytes, mass, gap }, relevancy) {
   const total = (rows) => rows.reduce((sum, i) => sum + Math.sqrt(mass[i]), 0), all = match.length + around.length;
   const samples = [match, around].flatMap((rows, other) => {
     const share = all / 2 / total(rows);
-    return rows.map((i) => ({ x: color(i), y: 1 - other, w: Math.sqrt(mass[i]) * share }));
+    return rows.map((i) => ({ at: color(i), is: 1 - other, weight: Math.sqrt(mass[i]) * share }));
   });
-  const beta = logistic(samples);
+  const beta = fitted(samples, 4, RIDGE, ROUNDS);
   return relevancy.map((value, i) => (value > FAINT ? value / (1 + Math.exp(-color(i).reduce((sum, x, k) => sum + x * beta[k], 0))) : 0));
 }
 
@@ -93,35 +95,6 @@ function neighborhood(centers, rows, distance) {
         for (let c = -1; c <= 1; c++) if (cells.get(key(x + a, y + b, z + c))?.some(here)) return true;
     return false;
   };
-}
-
-/** Fit a logistic regression by Newton's method; the last coefficient is the intercept. */
-function logistic(samples) {
-  const beta = [0, 0, 0, 0];
-  for (let round = 0; round < ROUNDS; round++) {
-    const slope = beta.map((b, k) => (k < 3 ? b / SHARP : 0)), bend = beta.map((_, k) => beta.map((_, j) => (k === j ? (k < 3 ? 1 / SHARP : 1e-9) : 0)));
-    for (const { x, y, w } of samples) {
-      const p = 1 / (1 + Math.exp(-(x[0] * beta[0] + x[1] * beta[1] + x[2] * beta[2] + beta[3]))), curve = w * p * (1 - p);
-      for (let k = 0; k < 4; k++) {
-        slope[k] += w * (p - y) * x[k];
-        for (let j = 0; j < 4; j++) bend[k][j] += curve * x[k] * x[j];
-      }
-    }
-    solve(bend, slope).forEach((step, k) => (beta[k] -= step));
-  }
-  return beta;
-}
-
-/** Solve a small symmetric positive definite system by elimination. */
-function solve(matrix, right) {
-  const size = right.length, rows = matrix.map((row, k) => [...row, right[k]]);
-  for (let k = 0; k < size; k++)
-    for (let j = 0; j < size; j++) {
-      if (j === k) continue;
-      const share = rows[j][k] / rows[k][k];
-      for (let c = k; c <= size; c++) rows[j][c] -= share * rows[k][c];
-    }
-  return rows.map((row, k) => row[size] / row[k]);
 }
 
 /** Draw a view's heat and depth: what each Gaussian fills, spread over its footprint. */
@@ -253,9 +226,27 @@ export function join(pieces, weight) {
 
 /** Unite the things that some piece covers together, and no photo shows apart. */
 function united(things, together) {
-  const photos = things.map(photosOf), parent = things.map((_, t) => t), root = (t) => (parent[t] === t ? t : (parent[t] = root(parent[t])));
-  for (const [a, b] of together) {
-    if ([...photos[a]].some((photo) => photos[b].has(photo))) continue;
+  const photos = things.map(photosOf);
+  return grouped(things, together.filter(([a, b]) => ![...photos[a]].some((photo) => photos[b].has(photo))));
+}
+
+/** Unite slim things with what stands on or below them. boxes: the things' upright boxes. */
+export function stacked(things, boxes) {
+  const pairs = [];
+  boxes.forEach(({ center, axes, size }, a) => {
+    const wide = Math.max(size[0], size[1]);
+    if (size[2] < SLIM * wide) return;
+    boxes.forEach((other, b) => {
+      const [x, y, high] = axes.map((axis) => axis.reduce((sum, value, k) => sum + value * (other.center[k] - center[k]), 0));
+      if (a !== b && Math.hypot(x, y) < STRAIGHT * wide && Math.abs(high) < 1.5 * size[2] + other.size[2] / 2) pairs.push([a, b]);
+    });
+  });
+  return grouped(things, pairs);
+}
+
+function grouped(things, pairs) {
+  const parent = things.map((_, t) => t), root = (t) => (parent[t] === t ? t : (parent[t] = root(parent[t])));
+  for (const [a, b] of pairs) {
     const [low, high] = [root(a), root(b)].sort((x, y) => x - y);
     parent[high] = low;
   }

@@ -92,7 +92,7 @@ def test_the_first_that_fit_are_kept_and_the_rest_is_read_ahead_once_per_round()
 
 
 def test_several_photos_are_read_at_once():
-    together = threading.Barrier(3, timeout=10)
+    together = threading.Barrier(3, timeout=60)
 
     def read(index):
         together.wait()

@@ -9,9 +9,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from pages import DESK, browser, opened, rest, served, until, until_linked, until_told
 from painted_scene import CHANNELS, encode_texts, painted_file, painted_scene
 from PIL import Image
-from test_web_page import DESK, SIDE, browser, opened, rest, served  # noqa: F401
 
 from lab.baselines.lifting import LiftedFeatures
 from lang3dxl_ns.common.errors import UserError
@@ -148,7 +148,7 @@ def spot(page, scene, x, y):
 
 
 @pytest.mark.slow
-def test_a_photo_lies_exactly_over_the_rendering_and_leaves_with_the_eye(browser, file, photos):  # noqa: F811
+def test_a_photo_lies_exactly_over_the_rendering_and_leaves_with_the_eye(browser, file, photos):
     with live(file, photos) as server:
         page = opened(browser, address_of(server), DESK)
         page.emulate_media(reduced_motion="reduce")
@@ -170,7 +170,7 @@ def test_a_photo_lies_exactly_over_the_rendering_and_leaves_with_the_eye(browser
         clip = page.evaluate("document.getElementById('photo').style.clipPath")
         shown = place["width"] - float(clip.split()[1].removesuffix("px"))
         assert shown + place["x"] - corner["x"] == pytest.approx(0.25 * corner["width"], abs=1)
-        assert f"photo={ALL.replace('/', '%2F')}" in page.url
+        until_linked(page, f"photo={ALL.replace('/', '%2F')}")
         page.evaluate("lang3dxl.view.mover.free = true")
         page.locator("#frame").press("ArrowLeft")
         page.locator("#over").wait_for(state="hidden")
@@ -184,7 +184,7 @@ def test_a_photo_lies_exactly_over_the_rendering_and_leaves_with_the_eye(browser
 
 
 @pytest.mark.slow
-def test_a_word_taught_in_the_page_is_in_the_scenes_file_and_in_the_page(browser, file, photos):  # noqa: F811
+def test_a_word_taught_in_the_page_is_in_the_scenes_file_and_in_the_page(browser, file, photos):
     with live(file, photos) as server:
         page = opened(browser, address_of(server), DESK)
         scene = painted_scene()
@@ -203,26 +203,16 @@ def test_a_word_taught_in_the_page_is_in_the_scenes_file_and_in_the_page(browser
         page.get_by_role("button", name="Not this").click()
         page.mouse.click(*spot(page, scene, -0.8, -0.8))
         page.get_by_text("2 examples").wait_for()
-        for _ in range(100):
-            page.wait_for_timeout(100)
-            if in_file(file)["cupola of mine"]["examples"] != word["examples"]:
-                break
+        until(page, lambda: in_file(file)["cupola of mine"]["examples"] != word["examples"])
         page.get_by_role("button", name="Undo").click()
-        for _ in range(100):
-            page.wait_for_timeout(100)
-            if in_file(file)["cupola of mine"] == word:
-                break
-        assert in_file(file)["cupola of mine"] == word
+        until(page, lambda: in_file(file)["cupola of mine"], word)
         page.get_by_role("button", name="Forget").click()
-        for _ in range(100):
-            page.wait_for_timeout(100)
-            if not in_file(file):
-                break
-        assert in_file(file) == {} and page.complaints == []
+        until(page, lambda: in_file(file), {})
+        assert page.complaints == []
         page.close()
 
 
-def test_a_name_that_is_half_typed_stays_when_an_answer_arrives(browser, file, tmp_path):  # noqa: F811
+def test_a_name_that_is_half_typed_stays_when_an_answer_arrives(browser, file, tmp_path):
     write_page(Page(read_scene(file, "cpu")), tmp_path / "page")
     with served(tmp_path / "page") as address:
         page = opened(browser, address, DESK)
@@ -231,7 +221,8 @@ def test_a_name_that_is_half_typed_stays_when_an_answer_arrives(browser, file, t
         page.get_by_role("button", name="Teach a word").click()
         name = page.get_by_role("textbox", name="Name")
         name.click(click_count=3)
-        page.keyboard.type("giz")
+        page.evaluate("lang3dxl.ask('sky')")  # draws all cards anew
+        page.keyboard.type("giz")  # instead of the name, which is still selected
         page.evaluate("lang3dxl.ask('wall')")  # draws all cards anew
         page.keyboard.type("mo")
         assert name.input_value() == "gizmo"
@@ -239,12 +230,12 @@ def test_a_name_that_is_half_typed_stays_when_an_answer_arrives(browser, file, t
         named = "lang3dxl.prompts.filter(({ examples }) => examples).map(({ text }) => text)"
         assert page.evaluate(named) == ["like this 1"]  # it isn't done yet
         page.keyboard.press("Enter")
-        assert page.evaluate(named) == ["gizmo"]
+        until(page, named, ["gizmo"])
         page.close()
 
 
 @pytest.mark.slow
-def test_a_static_page_writes_words_that_the_scene_learns_as_if_marked_there(browser, file, photos, tmp_path):  # noqa: F811
+def test_a_static_page_writes_words_that_the_scene_learns_as_if_marked_there(browser, file, photos, tmp_path):
     scene = read_scene(file, "cpu")
     write_page(Page(scene, photos=photos), tmp_path / "page")
     with served(tmp_path / "page") as address:
@@ -266,6 +257,7 @@ def test_a_static_page_writes_words_that_the_scene_learns_as_if_marked_there(bro
         name.press("Enter")
         with page.expect_download() as saved:
             page.get_by_role("button", name="Save").click()
+        until_linked(page, "like=gizmo")
         link = page.url
         (word,) = load_words(saved.value.path())
         (example,) = word.examples
@@ -277,13 +269,15 @@ def test_a_static_page_writes_words_that_the_scene_learns_as_if_marked_there(bro
         page.reload()
         page.evaluate("lang3dxl.ready.then(() => true)")
         told = "lang3dxl.prompts.map(({ text, matching }) => [text, matching])"
+        until(page, "lang3dxl.prompts.length", 1)
         shown = page.evaluate(told)
         page.evaluate("lang3dxl.clear()")
         assert page.evaluate("lang3dxl.ask('gizmo')")["matching"] == shown[0][1]
         other = browser.new_context().new_page()  # without what this browser keeps
         other.goto(link)
         other.evaluate("lang3dxl.ready.then(() => true)")
-        assert other.evaluate(told) == shown and shown[0][0] == "gizmo"
+        until(other, told, shown)
+        assert shown[0][0] == "gizmo"
         other.close()
         page.close()
 
@@ -322,13 +316,14 @@ def test_what_is_large_and_floats_before_the_wall_is_hidden_and_left_out(tmp_pat
 
 
 @pytest.mark.slow
-def test_a_misspelled_word_is_offered_where_the_answer_is_not_sure(browser, file):  # noqa: F811
+def test_a_misspelled_word_is_offered_where_the_answer_is_not_sure(browser, file):
     with live(file) as server:
         page = opened(browser, address_of(server), DESK)
         page.evaluate("lang3dxl.ask('windwos')")
-        assert "Did you mean windows?" in page.locator("#near").inner_text()
+        until_told(page, "#near", "Did you mean windows?")
         page.locator("#near").get_by_role("button", name="windows", exact=True).click()
         page.locator("#prompts strong", has_text="windows").wait_for()
-        assert page.locator("#prompts strong").all_inner_texts() == ["windows"]
-        assert page.locator("#near").inner_text() == "" and page.complaints == []
+        until(page, "lang3dxl.prompts.map(({ text }) => text).join()", "windows")
+        until(page, "document.getElementById('near').textContent", "")
+        assert page.complaints == []
         page.close()

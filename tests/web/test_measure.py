@@ -4,21 +4,22 @@ import re
 from dataclasses import replace
 
 import numpy as np
+from pages import DESK, browser, opened, served, until_linked, until_told
 from painted_scene import painted_file, painted_scene
-from test_web_page import DESK, browser, opened, served  # noqa: F401
 
 from lang3dxl_ns.scene.georeference import Georeference
 from lang3dxl_ns.web.write_page import Page, write_page
 
 CLICK = """async ([x, y]) => {
-  const [column, row] = lang3dxl.view.pixel([x, y, 0]);
+  const [column, row] = lang3dxl.view.pixel([x, y, 0]), status = document.getElementById("status");
+  status.textContent = "";
   lang3dxl.view.dispatchEvent(new CustomEvent("click", { detail: { x: column, y: row } }));
-  await new Promise((go) => setTimeout(go, 300));
-  return document.getElementById("status").textContent;
+  while (!status.textContent) await new Promise((go) => setTimeout(go, 50));
+  return status.textContent;
 }"""
 
 
-def test_two_clicks_tell_a_distance_in_meters_and_its_height(browser, tmp_path):  # noqa: F811
+def test_two_clicks_tell_a_distance_in_meters_and_its_height(browser, tmp_path):
     meters = Georeference(20.0, (0.0, 1.0, 0.0), (1.0, 0.0, 0.0), 0.03, 5)
     for name, known in (("gps", meters), ("none", None)):
         write_page(Page(painted_scene(file=replace(painted_file(), georeference=known))), tmp_path / name)
@@ -46,14 +47,12 @@ SCALE = """() => {
 }"""
 
 FRAMES = """async () => {
-  for (let k = 0; k < 100; k++) {
-    await new Promise((go) => setTimeout(go, 50));
-    if (lang3dxl.view.resting) return;
-  }
+  do await new Promise((go) => setTimeout(go, 50));
+  while (!lang3dxl.view.resting);
 }"""
 
 
-def test_a_typed_length_sets_the_scale_and_travels_in_the_link(browser, tmp_path):  # noqa: F811
+def test_a_typed_length_sets_the_scale_and_travels_in_the_link(browser, tmp_path):
     write_page(Page(painted_scene()), tmp_path)
     with served(tmp_path) as address:
         tab = opened(browser, address, DESK)
@@ -64,7 +63,8 @@ def test_a_typed_length_sets_the_scale_and_travels_in_the_link(browser, tmp_path
         units = float(tab.evaluate(CLICK, [0.6, 0.5]).split()[0])
         tab.fill("#length", "30,0")
         tab.press("#length", "Enter")
-        assert tab.evaluate("document.getElementById('status').textContent").startswith("30 m apart")
+        until_told(tab, "#status", "30 m apart")
+        until_linked(tab, "unit=")
         link = tab.evaluate("location.href")
         tab.close()
         tab = opened(browser, link, DESK)
@@ -75,7 +75,7 @@ def test_a_typed_length_sets_the_scale_and_travels_in_the_link(browser, tmp_path
     assert abs(found["width"] / found["unit"] * 30 / units / meters - 1) < 0.02
 
 
-def test_the_arrow_points_north(browser, tmp_path):  # noqa: F811
+def test_the_arrow_points_north(browser, tmp_path):
     meters = Georeference(20.0, (0.0, -1.0, 0.0), (1.0, 0.0, 0.0), 0.03, 5)
     write_page(Page(painted_scene(file=replace(painted_file(), georeference=meters))), tmp_path)
     angles = []

@@ -2,13 +2,13 @@
 
 import numpy as np
 import pytest
+from pages import DESK, browser, opened, served, until, until_linked
 from painted_scene import painted_scene
-from test_web_page import DESK, browser, opened, rest, served  # noqa: F401 — browser is a fixture
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.things.find import Things
-from lang3dxl_ns.things.grammar import Sight, answer, parse
-from lang3dxl_ns.things.join import join, without_crumbs
+from lang3dxl_ns.things.grammar import Sight, answer, parse, unsure
+from lang3dxl_ns.things.join import Joined, join, stacked, without_crumbs
 from lang3dxl_ns.things.pieces import LEAST, Piece, split
 from lang3dxl_ns.things.thing import Thing, upright_box
 from lang3dxl_ns.web.write_page import Page, write_page
@@ -30,7 +30,7 @@ SIGHT = Sight(np.array([1.0, 0, 0]), np.array([0, 0, 1.0]), np.array([0, 1.0, 0]
 
 
 @pytest.fixture(scope="module")
-def page(browser, tmp_path_factory):  # noqa: F811
+def page(browser, tmp_path_factory):
     folder = tmp_path_factory.mktemp("page")
     write_page(Page(painted_scene()), folder)
     with served(folder) as address:
@@ -55,42 +55,44 @@ def test_a_question_is_read_as_by_python(page, text):
     assert found == expected
 
 
-def test_questions_choose_the_things_that_python_chooses(page):
+SUPERLATIVES = ("", "highest ", "widest ", "leftmost ", "largest ")
+RELATIONS = (*("left of", "right of", "above", "below", "next to", "between", "in", "in front of", "behind"),)
+ASKED = [f"{first}window {relation} the portal" for relation in RELATIONS for first in SUPERLATIVES]
+ASKED += ["smallest window", "tallest tower", "third window from the left", "second tower from the top",
+          "ninth window from the right", "how many windows above the tower"]  # fmt: skip
+
+
+def test_questions_choose_the_things_that_python_chooses_and_are_as_unsure(page):
     rng = np.random.default_rng(3)
-    words = {"window": 9, "portal": 2, "tower": 3}
     found, number = [], 0
-    for word, count in words.items():
+    for word, count, perhaps in (("window", 9, 2), ("windows", 9, 2), ("portal", 2, 0), ("tower", 3, 1)):
         things = []
-        for _ in range(count):
+        for _ in range(count + perhaps):
             number += 1
             center, size = rng.uniform(0, 9, 3), rng.uniform(0.5, 3, 3)
-            things.append(Thing(number, word, 1.0, 3, center, np.eye(3), size, np.array([number])))
-        found.append(Things(word, things, count, count))
-    numbers = ("center", "axes", "size")
-    listed = {
-        one.word: [{"id": t.id, **{name: getattr(t, name).tolist() for name in numbers}} for t in one.things]
-        for one in found
-    }
+            views = int(rng.integers(2, 12))
+            things.append(Thing(number, word, 1.0, views, center, np.eye(3), size, np.array([number])))
+        found.append(Things(word, things[:count], things[count:]))
+
+    def listed(things: list[Thing]) -> list[dict]:
+        numbers = ("center", "axes", "size")
+        return [{"id": t.id, "views": t.views} | {name: getattr(t, name).tolist() for name in numbers}
+                for t in things]  # fmt: skip
+
+    given = {one.word: {"things": listed(one.things), "candidates": listed(one.candidates)} for one in found}
     view = {name: getattr(SIGHT, name).tolist() for name in ("right", "up", "ahead")}
-    some = 0
-    for relation in (
-        "left of",
-        "right of",
-        "above",
-        "below",
-        "next to",
-        "between",
-        "in",
-        "in front of",
-        "behind",
-    ):
-        for start in ("", "highest ", "widest ", "leftmost "):
-            text = f"{start}window {relation} the portal"
-            expected = [t.id for t in answer(parse(text), found, lambda _: SIGHT)]
-            body = "return m.answerTo(m.parse(given.text), given.things, given.view).map(({ id }) => id);"
-            assert module(page, "grammar", body, {"text": text, "things": listed, "view": view}) == expected
-            some += len(expected)
-    assert some > 20
+    body = """const { found, view } = given;
+      const things = Object.fromEntries(Object.entries(found).map(([word, one]) => [word, one.things]));
+      return given.asked.map((text) => {
+        const request = m.parse(text), chosen = m.answerTo(request, things, view);
+        return [chosen.map(({ id }) => id), m.unsure(request, found, view)];
+      });"""
+    answers = module(page, "grammar", body, {"asked": ASKED, "found": given, "view": view})
+    for text, (chosen, doubt) in zip(ASKED, answers, strict=True):
+        assert chosen == [t.id for t in answer(parse(text), found, lambda _: SIGHT)], text
+        assert doubt == unsure(parse(text), found, lambda _: SIGHT), text
+    assert sum(len(chosen) for chosen, _ in answers) > 20
+    assert 5 < sum(doubt is None for _, doubt in answers) < len(ASKED) - 5
 
 
 def numbered(labels) -> list[int]:
@@ -134,6 +136,25 @@ def test_pieces_join_as_in_python(page):
     assert sorted(found) == sorted([sorted(one.rows.tolist()), one.views] for one in expected)
 
 
+def test_slim_things_join_with_what_stands_on_them_as_in_python(page):
+    rng = np.random.default_rng(4)
+    count = 40
+    boxes = [
+        (rng.uniform(0, 9, 3), np.eye(3), rng.uniform((0.3, 0.3, 0.3), (0.6, 0.6, 4))) for _ in range(count)
+    ]
+    parts = [Joined(np.array([i]), 1.0, []) for i in range(count)]
+    expected = sorted(sorted(one.rows.tolist()) for one in stacked(parts, boxes))
+    assert 5 < len(expected) < count
+    given = {
+        "parts": [{"rows": [i], "weight": 1, "votes": []} for i in range(count)],
+        "boxes": [
+            dict(zip(("center", "axes", "size"), map(np.ndarray.tolist, box), strict=True)) for box in boxes
+        ],
+    }
+    body = "return m.stacked(given.parts, given.boxes).map(({ rows }) => rows.toSorted((a, b) => a - b));"
+    assert sorted(module(page, "things", body, given)) == expected
+
+
 def test_boxes_are_those_of_python(page):
     rng = np.random.default_rng(2)
     for angle in (0.0, 0.4, 1.3):
@@ -155,26 +176,23 @@ def test_a_word_lists_its_things_and_one_can_be_chosen_hidden_and_linked(page):
     summary.wait_for()
     assert summary.inner_text().startswith("2")
     summary.click()
-    chips = page.locator("#prompts ol button")
-    assert chips.count() == 2
-    assert page.locator("#boxes path.thing").count() == 2
+    until(page, "document.querySelectorAll('#prompts ol button').length", 2)
+    until(page, "document.querySelectorAll('#boxes path.thing').length", 2)
     page.evaluate("document.body.dispatchEvent(new KeyboardEvent('keydown', { key: ']', bubbles: true }))")
-    rest(page)
-    assert chips.nth(0).get_attribute("aria-pressed") == "true"
+    page.locator("#prompts ol li:first-child button[aria-pressed=true]").wait_for()
     page.get_by_role("button", name="Hide the rest").click()
+    until(page, "lang3dxl.view.only !== null")
     shown = page.evaluate("lang3dxl.view.only.size")
     assert 0 < shown < page.evaluate("lang3dxl.view.root.count")
-    rest(page)
-    page.wait_for_timeout(400)
+    until_linked(page, "thing=")
+    until_linked(page, "alone=1")
     address = page.evaluate("location.hash")
-    assert "thing=" in address
-    assert "alone=1" in address
     page.locator("body").press("Escape")
-    assert page.evaluate("lang3dxl.view.only") is None
+    until(page, "lang3dxl.view.only", None)
     page.evaluate("lang3dxl.clear()")
     page.evaluate("(hash) => { location.hash = hash; }", address)
     page.locator("#prompts ol button[aria-pressed=true]").wait_for()
-    assert page.evaluate("lang3dxl.view.only.size") == shown
+    until(page, "lang3dxl.view.only?.size", shown)
     page.evaluate("lang3dxl.clear()")
 
 
@@ -183,8 +201,8 @@ def test_questions_typed_into_the_page_are_answered_or_refused(page):
     assert told.startswith("2") and "windows" in told
     told = page.evaluate("lang3dxl.ask('leftmost window').then(({ told }) => told)")
     assert told.startswith("window ")
-    assert page.locator("#prompts ol button[aria-pressed=true]").count() == 1
+    until(page, "document.querySelectorAll('#prompts ol button[aria-pressed=true]').length", 1)
     refused = "lang3dxl.ask('how many windows near the dome').catch((error) => error.message)"
     assert "near" in page.evaluate(refused)
     page.evaluate("lang3dxl.clear()")
-    assert page.evaluate("lang3dxl.view.only") is None
+    until(page, "lang3dxl.view.only", None)
