@@ -379,9 +379,7 @@ class Lang3DXLTrainer(Trainer):
         path = self.base_dir / f"{data.capture.folder.name or 'scene'}{SUFFIX}"
         config, place = model.config, self.config.load_checkpoint
         how = f"{self.config.method_name}, {config.decoder.name}, {config.total_steps} iterations"
-        with torch.no_grad():
-            poses = torch.stack([model.run.pose(view) for view in data.cameras]).cpu()
-        file = data.record(poses)
+        file = data.record(model.run)
         file.write(self.base_dir / SCENE_FILE)
         scene = model.scene(file)
         checkpoints = self.config.load_dir or (place and place.parent)

@@ -160,8 +160,7 @@ class Run:
 
     def scene(self) -> Scene:
         """Return the scene so far, which later training doesn't change."""
-        poses = torch.stack([self.state.pose(view) for view in self.data.cameras]).detach().cpu()
-        return snapshot(self.state, self.data.record(poses))
+        return snapshot(self.state, self.data.record(self.state))
 
     def save(self, step: int) -> Scene:
         """Write the checkpoint after an iteration, and the scene so far."""
