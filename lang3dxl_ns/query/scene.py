@@ -21,8 +21,7 @@ from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import expanded
 from lang3dxl_ns.components.appearance import AppearanceField, Look, render_in_look
 from lang3dxl_ns.components.feature_decoder import Decoder
-from lang3dxl_ns.files.matching_splat import write_matching
-from lang3dxl_ns.files.splat_file import write_splats
+from lang3dxl_ns.files.splat_file import write_matching, write_splats
 from lang3dxl_ns.preparation.encoders import load_image_text_encoder
 from lang3dxl_ns.query import answer
 from lang3dxl_ns.query.answering import Place
@@ -468,9 +467,9 @@ class Scene:
         words = shipped_vocabulary() if words is None else texts_of(words, "a word")
         return answer.words_at(self, self.camera(place, size), x, y, words, most)
 
-    def things(self, texts: str | Sequence[str]) -> list[Things]:
-        """Find the single things that each prompt names: windows, portals, towers. See `things_of`."""
-        return things_of(self, texts)
+    def things(self, texts: Text | Sequence[Text]) -> list[Things]:
+        """Find the single things that each prompt of `texts` (see `ask`) names: windows, portals, towers."""
+        return things_of(self, self.ask(texts))
 
     # ── words taught by example ─────────────────────────────────────────────────────────────────────
 

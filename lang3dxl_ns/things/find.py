@@ -14,6 +14,7 @@ from torch import Tensor
 
 from lang3dxl_ns.query.answering import Answering
 from lang3dxl_ns.query.doubt import doubtful, peaks
+from lang3dxl_ns.query.question import Question
 from lang3dxl_ns.rendering import composite
 from lang3dxl_ns.things.join import VIEWS, Joined, join, stacked, without_crumbs
 from lang3dxl_ns.things.pieces import FILLED, LEVELS, Piece, Shown, pieces_of
@@ -61,17 +62,14 @@ class Things:
         return sure if self.least == self.most else f"{sure}, perhaps {self.least} to {self.most}"
 
 
-def things_of(scene: Answering, texts: str | Sequence[str]) -> list[Things]:
-    """Find the single things that each prompt of `texts` names.
+def things_of(scene: Answering, question: Question) -> list[Things]:
+    """Find the single things that each prompt of a question to the scene names.
 
     Every training view's heat map falls into pieces (`pieces_of`), and pieces of several views are one thing
     where they share Gaussians (`join`). Where a prompt's colors differ from those around it, colors separate
     neighbors: the wall between two windows that CLIP sees as one. A thing that an earlier question to this
     scene found keeps its id.
-
-    Raises UserError as `Scene.ask` does.
     """
-    question = scene.ask(texts)
     mass = scene.mass.double().cpu().numpy()
     means, up = scene.splats.means.double().cpu().numpy(), up_of(scene)
     sharp = [_sharpened(scene, relevancy) for relevancy in question.relevancy]
