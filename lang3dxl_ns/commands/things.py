@@ -36,7 +36,7 @@ class ListThings:
     out: Path | None = None
     """Folder for the files."""
     splats: bool = False
-    """Write a splat file for each thing too."""
+    """Write a splat file for each thing too, and scene.glb with things as features (EXT_mesh_features)."""
     clip: str | None = None
     """Name or folder of the scene's CLIP, if it is not where the scene file says."""
 

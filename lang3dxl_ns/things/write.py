@@ -14,6 +14,7 @@ import torch
 from PIL import Image, ImageDraw
 
 from lang3dxl_ns.common.files import make_folder, slugs, write_atomically
+from lang3dxl_ns.files.glb import encode_glb
 from lang3dxl_ns.files.splat_file import write_splats
 from lang3dxl_ns.query.heat_maps import PROMPT_COLORS
 from lang3dxl_ns.query.scene import Scene
@@ -106,9 +107,11 @@ def write_picture(scene: Scene, answers: Sequence[Things], path: Path) -> None:
 
 
 def write_things(scene: Scene, answers: Sequence[Things], folder: Path, look: str | None = None) -> int:
-    """Write a splat file for each thing, named by word and id, and return how many were written."""
+    """Write a splat file for each thing, named by word and id, and scene.glb with the ids of all as features;
+    return how many things were written."""
     make_folder(folder)
     baked, things = scene.baked(look), _each_once(answers)
+    write_atomically(folder / "scene.glb", encode_glb(baked, things=things, place=scene.file.georeference))
     words = dict(zip((one.word for one in answers), slugs([one.word for one in answers]), strict=True))
     for thing in things:
         rows = torch.from_numpy(np.sort(thing.rows)).to(scene.device)

@@ -81,10 +81,10 @@ export function sureOf(things) {
   return things.filter(({ views }) => views > Math.max(VIEWS, typical / 2));
 }
 
-/** How many there are, such as "34, perhaps 31 to 37". */
-export function count({ things, candidates }) {
+/** How many there are, such as "34, perhaps 31 to 37". after: a text behind the number. */
+export function count({ things, candidates }, after = "") {
   const least = sureOf(things).length, most = things.length + candidates.length;
-  return least === most ? `${things.length}` : `${things.length}, perhaps ${least} to ${most}`;
+  return things.length + after + (least === most ? "" : `, perhaps ${least} to ${most}`);
 }
 
 /** Tell what may make an answer wrong, or null. found: { things, candidates } of each word; shown: writes a word. */
