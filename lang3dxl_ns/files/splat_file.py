@@ -1,4 +1,4 @@
-"""Splat files (PLY, SPZ, SOG, GLB) for other programs: of all Gaussians, or of what matches a prompt."""
+"""Splat files (PLY, SPZ, SOG, GLB) for other programs."""
 
 from __future__ import annotations
 
@@ -89,30 +89,3 @@ def check_splat_name(path: Path) -> None:
         raise UserError(f"{path} is a folder: name a {SPLAT_NAMES} file in it")
     if path.suffix.lower() not in (".ply", ".spz", ".sog", ".glb"):
         raise UserError(f"{path.name} names no kind of splat file: end it in {SPLAT_NAMES}")
-
-
-def write_matching(
-    path: Path,
-    splats: Splats,
-    question: Question,
-    everything: bool,
-    index: str | Path | None,
-    solid: Bool[Tensor, " n"] | None = None,
-) -> int:
-    """Write the Gaussians that match a question of one prompt, or all with their relevancy; see
-    `Scene.export`. Of these, only `solid` ones are written, if given."""
-    relevancy, keep = question.relevancy[0], question.gaussians[0]
-    if solid is not None:
-        keep = keep & solid
-    if not everything and not keep.any():
-        best, level = float(relevancy.max()), question.thresholds[0]
-        raise UserError(
-            f"no Gaussian matches {question.prompts[0].text!r}: the best reaches {best:.2f}; lower "
-            f"--threshold, now {level:.2f}, or write all with their relevancy (--all)"
-        )
-    written = solid if everything else keep
-    if written is not None:
-        splats, relevancy = splats.select(written), relevancy[written]
-    if index is not None:
-        write_index(expanded(index), keep)
-    return write_splats(path, splats, relevancy)

@@ -22,6 +22,8 @@ from lang3dxl_ns.things.thing import Box, Sighting, Thing, upright_box
 
 COLORED = 20
 """Number of Gaussians within and around the matches below which colors tell nothing."""
+SAMPLED = 50_000
+"""Number of Gaussians, each of matches and of others, from which only every second one tells colors."""
 _KNOWN: WeakKeyDictionary[Answering, list[Thing]] = WeakKeyDictionary()
 """Things that were found in each scene so far: they keep their ids."""
 SAME = 0.5
@@ -116,11 +118,12 @@ def _sharpened(scene: Answering, relevancy: Float[Tensor, " n"]) -> Float[Tensor
 
     means, colors = scene.splats.means.cpu().numpy(), scene.splats.harmonics[:, 0].cpu().numpy()
     values, mass = relevancy.cpu().numpy(), scene.mass.cpu().numpy()
-    match = np.flatnonzero((values > 0.9) & (mass > 0))
+    sides = (np.flatnonzero(side & (mass > 0)) for side in (values > 0.9, values < 0.5))
+    match, around = (rows[:: 1 + len(rows) // SAMPLED] for rows in sides)
     if len(match) < COLORED:
         return relevancy
-    near = np.isfinite(KDTree(means[match]).query(means, distance_upper_bound=scene.gap)[0])
-    around = np.flatnonzero((values < 0.5) & near & (mass > 0))
+    distance, _ = KDTree(means[match]).query(means[around], distance_upper_bound=scene.gap)
+    around = around[np.isfinite(distance)]
     if len(around) < COLORED:
         return relevancy
     rows = np.concatenate([match, around])

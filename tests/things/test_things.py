@@ -176,6 +176,13 @@ def test_a_thing_keeps_its_id_in_later_questions_and_under_other_words():
     assert {one.id for one in alone.things} == {one.id for one in first.things}
 
 
+def test_a_sample_of_the_gaussians_tells_the_colors_of_a_word(monkeypatch):
+    every = painted_scene().things("windows")[0].things
+    monkeypatch.setattr("lang3dxl_ns.things.find.SAMPLED", 100)
+    some = painted_scene().things("windows")[0].things
+    assert [one.id for one in some] == [one.id for one in every]
+
+
 def test_the_catalog_names_the_nearest_neighbors_and_what_is_in_what(tmp_path):
     scene = painted_scene()
     row = [thing(i, "window", (x, 0, 5)) for i, x in enumerate([0, 3, 9])]
