@@ -10,7 +10,7 @@ from lab.benchmarks.questions import Known, ask_all
 from lab.landmark.instances import true_things
 from lab.landmark.landmark import Landmark
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.things.find import Things, things_of, up_of
+from lang3dxl_ns.things.find import Things, up_of
 from lang3dxl_ns.things.grammar import Request, Sight, answer, parse, sight_of, table, unsure
 from lang3dxl_ns.things.join import OFTEN, Joined, join, stacked, without_crumbs
 from lang3dxl_ns.things.pieces import Piece, Shown, pieces_of, split
@@ -169,11 +169,18 @@ def test_true_things_hold_each_solid_once(family, seed):
 
 def test_a_thing_keeps_its_id_in_later_questions_and_under_other_words():
     scene = painted_scene()
-    (first,), (again, _) = things_of(scene, "windows"), things_of(scene, ["window", "dome"])
+    (first,), (again, _) = scene.things("windows"), scene.things(["window", "dome"])
     assert len(first.things) == 2
     assert {one.id for one in first.things} == {one.id for one in again.things}
-    (alone,) = things_of(painted_scene(), "window")
+    (alone,) = painted_scene().things("window")
     assert {one.id for one in alone.things} == {one.id for one in first.things}
+
+
+def test_a_sample_of_the_gaussians_tells_the_colors_of_a_word(monkeypatch):
+    every = painted_scene().things("windows")[0].things
+    monkeypatch.setattr("lang3dxl_ns.things.find.SAMPLED", 100)
+    some = painted_scene().things("windows")[0].things
+    assert [one.id for one in some] == [one.id for one in every]
 
 
 def test_the_catalog_names_the_nearest_neighbors_and_what_is_in_what(tmp_path):
