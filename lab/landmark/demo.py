@@ -98,6 +98,7 @@ class Demo:
             (out / CHECKPOINT).unlink(missing_ok=True)
         with stages.stage("prepare"):
             run = begin(open_capture(scene), settings, out, scene / "lang3dxl_cache")
+            run.title = f"A generated {read_json(scene / 'scene.json')['family']}"
         trained = run.complete(stages)
         with stages.stage("evaluate"):
             evaluation = Evaluation(run.state, run.data, EvaluationSettings())

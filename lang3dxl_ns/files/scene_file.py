@@ -405,7 +405,6 @@ def _decoder(file: _File, described: dict[str, Any]) -> Decoder:
     stored = sum(prod(shape) for name, shape in file.shapes.items() if name.startswith("decoder."))
     needed = _parameters(settings, clip + dense)
     expect(needed <= 4 * stored + 10_000_000, "its decoder is larger than the file")
-    settings.pop("coarse_to_fine", None)  # earlier versions wrote it
     config, choice = SemanticFieldConfig(preset="short", **settings), DecoderConfig(name=described["name"])
     return file.loaded("decoder", make_decoder(choice, config, clip, dense))
 

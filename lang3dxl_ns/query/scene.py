@@ -36,7 +36,7 @@ from lang3dxl_ns.query.thresholds import match_thresholds, matching
 from lang3dxl_ns.query.trust import ANCHORS, alike, foreignness, judged
 from lang3dxl_ns.query.visibility import VisibleGaussians, measured, median_distance, total_pixels
 from lang3dxl_ns.query.vocabulary import closest_word, common_words, searched, shipped_vocabulary
-from lang3dxl_ns.rendering import Backend, Rendering, Splats, composite
+from lang3dxl_ns.rendering import Rendering, Splats, composite
 from lang3dxl_ns.rendering.gathering import filled_pixels
 from lang3dxl_ns.scene.camera import Camera, posed, resized, with_field_of_view, with_longer_side
 from lang3dxl_ns.scene.record import ScenePhoto, SceneRecord, overview, same_clip
@@ -84,8 +84,6 @@ class Scene:
     """Defaults of queries, sizes of pictures, and of the views that `visible` measures."""
     cache: Path | None = None
     """File that keeps which Gaussians the photos show; if None, every process measures them."""
-    backend: Backend = "auto"
-    """The rasterizer, see `rasterize`."""
     watch: Callable[[str], None] | None = None
     """Called with a short description of slow work; if None, a progress bar is shown."""
     _doubt_alone: dict[str, float] = field(default_factory=dict, init=False)
@@ -152,9 +150,7 @@ class Scene:
         look, the scene's rule chooses the lighting for this view."""
         if look is None and self.looks is not None:
             look = self.looks.of_view(camera)
-        return render_in_look(
-            self.splats, camera, look, channels, background=self.background, backend=self.backend
-        )
+        return render_in_look(self.splats, camera, look, channels, background=self.background)
 
     def view(
         self,
@@ -399,13 +395,12 @@ class Scene:
             self.config.views,
             self.config.view_side,
             cache=self.cache,
-            backend=self.backend,
             watch=self.watch,
         )
 
     def fill(self, camera: Camera, weight: Float[Tensor, "h w"]) -> Float[Tensor, " n"]:
         """Compute how many of a camera's pixels, each of a weight 0…1, every Gaussian fills."""
-        drawn = partial(composite, self.splats, camera, backend=self.backend)
+        drawn = partial(composite, self.splats, camera)
         return filled_pixels(drawn, weight, len(self.splats))
 
     @cached_property

@@ -125,7 +125,7 @@ def _views(scene: Scene, heat: Float[Tensor, "n q"]) -> Iterator[list[Shown]]:
         pose = camera.view_matrix.to(means)
         seen = means @ pose[:3, :3].T + pose[:3, 3]
         lit = torch.cat([heat.to(means), torch.ones_like(seen[:, 2:])], 1)
-        drawn = composite(splats, camera, torch.cat([lit, lit * seen[:, 2:]], 1), scene.backend)
+        drawn = composite(splats, camera, torch.cat([lit, lit * seen[:, 2:]], 1))
         maps, depths = np.split(np.moveaxis(drawn.cpu().numpy(), 2, 0), 2)
         inside = photo.foreground((camera.height, camera.width))
         keep = 1.0 if inside is None else inside.numpy()

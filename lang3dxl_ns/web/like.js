@@ -51,10 +51,11 @@ function likely(rows, examples) {
   return { direction, start };
 }
 
-/** Fit the logistic regression's weights by Newton's method; the last one, the constant, is hardly penalized. */
-function fitted(samples, size) {
+/** Fit a logistic regression by Newton's method. samples: { at: `size` numbers, the last one 1; is: 0 or 1; weight }; the
+ * last weight, the constant, is hardly penalized. */
+export function fitted(samples, size, ridge = RIDGE, steps = STEPS) {
   const weights = new Float64Array(size);
-  for (let step = 0; step < STEPS; step++) {
+  for (let step = 0; step < steps; step++) {
     const slope = new Float64Array(size), bend = Array.from({ length: size }, () => new Float64Array(size));
     for (const { at, is, weight } of samples) {
       const p = 1 / (1 + Math.exp(-at.reduce((sum, x, j) => sum + x * weights[j], 0)));
@@ -65,7 +66,7 @@ function fitted(samples, size) {
       }
     }
     for (let j = 0; j < size; j++) {
-      const penalty = j < size - 1 ? RIDGE : 1e-6;
+      const penalty = j < size - 1 ? ridge : 1e-6;
       slope[j] -= penalty * weights[j];
       bend[j][j] += penalty;
     }

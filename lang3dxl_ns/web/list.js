@@ -8,7 +8,7 @@ const NAMESPACE = "http://www.w3.org/2000/svg", CORNERS = [0, 1, 2, 3, 4, 5, 6, 
 const FILLED = 0.35, NARROW = 15, WIDE = 60; // share of the window that a thing fills after a flight; degrees of the lens
 const GAP = 4, LETTER = 8, LINE = 18; // pixels between labels, per letter, and of a line
 
-const count = ({ things, least, most }) => (least === most ? `${things.length}` : `${things.length}, perhaps ${Math.min(least, things.length)} to ${Math.max(most, things.length)}`);
+const count = ({ things, least, most }, found = "") => things.length + found + (least === most ? "" : `, perhaps ${Math.min(least, things.length)} to ${Math.max(most, things.length)}`);
 
 export class List extends EventTarget {
   /** about: the page's description; think: gives the worker a job; view, prompts: what is shown. Fires `change` when
@@ -41,7 +41,7 @@ export class List extends EventTarget {
   part(prompt) {
     if (!prompt.found) return null;
     const { things } = prompt.found, small = (label, act, more) => element("button", { className: "small", onclick: act, ...more }, label);
-    const summary = element("summary", {}, things.length ? `${count(prompt.found)} found${this.about.detail ? " in the coarse scene" : ""}` : "No single things found");
+    const summary = element("summary", {}, things.length ? count(prompt.found, this.about.detail ? " found in the coarse scene" : " found") : "No single things found");
     const made = element("details", { className: "things", open: Boolean(prompt.listed) }, summary);
     summary.addEventListener("click", (event) => {
       event.preventDefault();
@@ -182,21 +182,30 @@ export class List extends EventTarget {
     return drawn.sort((a, b) => b.own - a.own || b.asked - a.asked).flatMap((one) => this.outline(one, taken));
   }
 
-  outline({ prompt, thing: { center, axes, size }, thing, label, own, asked }, taken) {
-    const corners = CORNERS.map((c) => this.view.pixel(center.map((value, k) => axes.reduce((sum, axis, a) => sum + axis[k] * size[a] * (((c >> a) & 1) - 0.5), value))));
+  /** Draw a thing's box, and its label where that covers none of those in `taken`. */
+  outline({ prompt, thing, label, own, asked }, taken) {
+    const corners = cornersOf(thing).map((corner) => this.view.pixel(corner));
     if (!corners.every(Boolean)) return [];
-    const edges = CORNERS.flatMap((k) => [1, 2, 4].filter((step) => !(k & step)).map((step) => `M${corners[k]}L${corners[k + step]}`));
-    const path = document.createElementNS(NAMESPACE, "path"), text = document.createElementNS(NAMESPACE, "text");
-    path.setAttribute("d", edges.join(""));
+    const kind = `thing ${own ? "chosen" : asked ? "" : "aside"}`, edges = CORNERS.flatMap((k) => [1, 2, 4].filter((step) => !(k & step)).map((step) => `M${corners[k]}L${corners[k + step]}`));
+    const path = drawn("path", prompt.color, { class: kind, d: edges.join("") });
     const [x, y] = corners.reduce((best, corner) => (corner[1] < best[1] ? corner : best)), word = own ? `${shown(prompt.text)} ${label}` : label;
     const half = (LETTER * word.length) / 2, place = [x - half, y - 6 - LINE, x + half, y - 6];
-    const free = taken.every((other) => place[0] > other[2] + GAP || other[0] > place[2] + GAP || place[1] > other[3] + GAP || other[1] > place[3] + GAP);
-    for (const part of [path, text]) part.style.setProperty("--color", `rgb(${prompt.color})`), part.classList.add("thing", ...(own ? ["chosen"] : asked ? [] : ["aside"])); // prettier-ignore
-    if (!free) return [path];
+    const apart = (other) => place[0] > other[2] + GAP || other[0] > place[2] + GAP || place[1] > other[3] + GAP || other[1] > place[3] + GAP;
+    if (!taken.every(apart)) return [path];
     taken.push(place);
-    [["x", x], ["y", y - 6]].forEach(([name, value]) => text.setAttribute(name, value));
+    const text = drawn("text", prompt.color, { class: kind, x, y: y - 6 });
     text.textContent = word;
     text.addEventListener("click", () => this.choose(prompt, thing));
     return [path, text];
   }
+}
+
+const cornersOf = ({ center, axes, size }) =>
+  CORNERS.map((c) => center.map((value, k) => axes.reduce((sum, axis, a) => sum + axis[k] * size[a] * (((c >> a) & 1) - 0.5), value)));
+
+function drawn(tag, color, attributes) {
+  const made = document.createElementNS(NAMESPACE, tag);
+  for (const [name, value] of Object.entries(attributes)) made.setAttribute(name, value);
+  made.style.setProperty("--color", `rgb(${color})`);
+  return made;
 }

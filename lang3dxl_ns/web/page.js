@@ -60,7 +60,6 @@ function findPlaces() {
       if (turn !== prompt.turn) return;
       Object.assign(prompt, places);
       prompt.card.querySelector(".fly").disabled = !places.views.some((one) => one.shown);
-      drawBoxes();
     });
   }
 }
@@ -181,23 +180,7 @@ function draw(newest = null) {
 
 function drawBoxes() {
   drawScale(about, view);
-  const boxes = $("boxed").checked ? prompts.filter((prompt) => prompt.box && !prompt.listed) : [];
-  $("boxes").replaceChildren(...boxes.flatMap(outlineBox), ...list.outlines());
-}
-
-const CORNERS = [0, 1, 2, 3, 4, 5, 6, 7], NAMESPACE = "http://www.w3.org/2000/svg";
-
-function outlineBox({ box: { low, high }, color, text }) {
-  const corners = CORNERS.map((k) => view.pixel(low.map((value, axis) => ((k >> axis) & 1 ? high[axis] : value))));
-  if (!corners.every(Boolean)) return [];
-  const edges = CORNERS.flatMap((k) => [1, 2, 4].filter((step) => !(k & step)).map((step) => `M${corners[k]}L${corners[k + step]}`));
-  const [path, label] = ["path", "text"].map((tag) => document.createElementNS(NAMESPACE, tag));
-  path.setAttribute("d", edges.join(""));
-  const top = corners.reduce((best, corner) => (corner[1] < best[1] ? corner : best));
-  [["x", top[0]], ["y", top[1] - 6]].forEach(([name, value]) => label.setAttribute(name, value));
-  label.textContent = shown(text);
-  for (const part of [path, label]) part.style.setProperty("--color", `rgb(${color})`);
-  return [path, label];
+  $("boxes").replaceChildren(...list.outlines());
 }
 
 function fly(prompt) {
@@ -353,7 +336,7 @@ async function teachScene(prompt, before = prompt.text) {
     if (prompt.named && !about.live) tellCard(prompt, "This browser keeps it. Save writes a file for lang3dxl words --load, which learns it from the photos.");
     return;
   }
-  const answered = await fetch("api/teach", { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify({ name: prompt.text, before, examples: marks }) });
+  const answered = await postWord({ name: prompt.text, before, examples: marks });
   if (!answered.ok) return tellCard(prompt, `The scene did not learn it: ${await answered.text()}`);
   taughtHere.add(prompt.text);
   await think("forget", { texts: [prompt.text, before] });
@@ -362,6 +345,8 @@ async function teachScene(prompt, before = prompt.text) {
   prompt.told = (await answered.json()).told;
   draw();
 }
+
+const postWord = (word) => fetch("api/teach", { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(word) });
 
 function tellCard(prompt, told) {
   prompt.told = told;
@@ -377,7 +362,7 @@ async function forget(prompt) {
   kept.store("words", kept.list("words").filter(({ name }) => name !== prompt.text));
   remove(prompt);
   if (!taughtHere.delete(prompt.text)) return;
-  await fetch("api/teach", { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify({ name: prompt.text, before: prompt.text, examples: [] }) });
+  await postWord({ name: prompt.text, before: prompt.text, examples: [] });
   await think("forget", { texts: [prompt.text] });
 }
 
@@ -407,7 +392,7 @@ const shownNow = (stops = tour.fields) =>
   written({
     stops,
     view: view.mover.address, walk: view.mover.walking ? 1 : "", not: $("not").value, hide: Number($("hide").value) || "", look: chosenLook,
-    unit: about.unit, boxes: $("boxed").checked ? 1 : "", cameras: $("cameras").ariaPressed === "true" ? 1 : "", photo: photos.shown?.name, ...list.fields,
+    unit: about.unit, cameras: $("cameras").ariaPressed === "true" ? 1 : "", photo: photos.shown?.name, ...list.fields,
     prompts: prompts.filter(({ examples }) => !examples || examples.length).map(asField),
   }); // prettier-ignore
 
@@ -426,7 +411,6 @@ async function apply(hash, turn = drop(), isStop = false) {
   if (isStop && wanted.view) view.mover.flyToAddress(wanted.view);
   else if (wanted.view) view.mover.address = wanted.view;
   view.mover.walk(wanted.walk === "1");
-  $("boxed").checked = wanted.boxes === "1";
   if (!isStop) about.unit = Number(wanted.unit) > 0 && Number.isFinite(Number(wanted.unit)) ? Number(wanted.unit) : null;
   $("cameras").ariaPressed = String(wanted.cameras === "1");
   $("hide").value = Number(wanted.hide) || 0;
@@ -503,10 +487,9 @@ function listen() {
     clearTimeout(typing);
     typing = setTimeout(() => attempt(answerAll), TYPING);
   });
-  on("boxed", "change", () => (drawBoxes(), keepAddress()));
   on("clear", "click", clear);
   on("overview", "click", () => (photos.hide(), quiet(), view.mover.overview()));
-  on("teach", "click", () => startWord().card.querySelector("input").focus());
+  on("teach", "click", () => startWord().card.querySelector("button").focus()); // no name yet: a phone's keyboard would cover the view
   on("still", "click", saveStill);
   on("link", "click", copyLink);
   on("look", "change", () => chooseLook($("look").value).then(() => keepAddress()));
@@ -657,18 +640,10 @@ async function readFloaters() {
   hideFloaters();
 }
 
-/** Keep the eye in the free space from now on. */
-function limit(space) {
-  const { mover } = view, untouched = mover.address === mover.first;
-  mover.space = space;
-  if (untouched) mover.jump(mover.overviewStand()); // a narrow window may have room behind the overview's photo
-}
-
 /** Show the prompts in the address, or else those that the page opens with. */
 async function begin() {
   const turn = cleared;
-  view.mover.first = location.hash.length > 1 ? null : view.mover.address;
-  if (about.words) setTimeout(() => think("space").then(limit)); // behind the prompts
+  if (about.words) setTimeout(() => think("space").then((space) => (view.mover.space = space))); // behind the prompts
   setTimeout(() => attempt(readFloaters));
   if (about.detail) new Detail(about, view, think, { read: fetched, question, failed: (error) => say(error.message) });
   if (about.hide) $("hide").value = 50;

@@ -1,7 +1,7 @@
 // Photos: a strip of them, one over the rendering with a divider, and the cameras that took them.
 import { element, say } from "./cards.js";
 
-const NAMESPACE = "http://www.w3.org/2000/svg", LONG = 0.07; // length of a drawn camera, share of the overview's depth
+const LONG = 0.07; // length of a drawn camera, share of the overview's depth
 const $ = (id) => document.getElementById(id);
 
 export class Photos {
@@ -118,15 +118,7 @@ export class Photos {
       const [eye, ...rim] = corners.map((pixel) => pixel.map((value) => value.toFixed(1)));
       paths[photo.doubtful ? "doubtful" : "sure"] += rim.map((corner, k) => `M${eye}L${corner}L${rim[(k + 1) % 4]}`).join("");
     }
-    for (const [kind, d] of Object.entries(paths)) this.path(kind).setAttribute("d", d);
-  }
-
-  path(kind) {
-    const found = $("pyramids").querySelector(`.${kind}`);
-    if (found) return found;
-    const made = $("pyramids").appendChild(document.createElementNS(NAMESPACE, "path"));
-    made.setAttribute("class", kind);
-    return made;
+    for (const [kind, d] of Object.entries(paths)) $("pyramids").querySelector(`.${kind}`).setAttribute("d", d);
   }
 
   /** The eye of a photo and the four corners of its picture, in the world. */

@@ -25,9 +25,10 @@ MOST_CAMERAS = 400
 """Most photos whose cameras a page knows; evenly spaced ones are kept."""
 _ROOM = 1.06
 """Room around what the overview shows besides its photo."""
-_CUT, _WIDER, _BEHIND = 0.003, 1.6, 1.5
+_CUT, _WIDER, _STEEP, _BEHIND, _LARGE = 0.001, 2.0, 0.9, 1.5, 3.0
 """Share of what a scene's views show that may lie beyond each side of the overview; how much farther than its
-photo an overview reaches; and how much farther than the middle of the scene what it shows may lie."""
+photo an overview reaches, and up to which slope; how much farther than the middle of the scene what it shows
+may lie; and how much larger than most a Gaussian is that shows sky or ground."""
 
 
 def photos_shown(scene: Scene) -> list[ScenePhoto]:
@@ -80,17 +81,20 @@ def extent(scene: Scene) -> list[float]:
     places, mass = _seen_from(camera, scene.splats), scene.mass
     middle = float(places[:, 2][scene.splats.sound()].median()) if len(places) else 0.0
     # The sky and distant surroundings lie far behind, and what stands before the landmark hides less of it.
-    kept = (places[:, 2] > 0.5 * middle) & (places[:, 2] < _BEHIND * middle) & (mass > 0)
+    known, sizes = mass > 0, scene.splats.scales.amax(1)
+    kept = (places[:, 2] > 0.5 * middle) & (places[:, 2] < _BEHIND * middle) & known
     if middle <= 0 or not bool(kept.any()):
         return [*own, 1.0]
+    kept &= sizes <= max(_LARGE * float(sizes[known].median()), float(sizes[kept].min()))
     places, mass = places[kept], mass[kept]
     ends = list(own)
     for axis in (0, 1):
         slopes, order = (places[:, axis] / places[:, 2]).sort()
         share = mass[order].cumsum(0) / mass.sum()
         low, high = (int((share < level).sum().clamp_max(len(share) - 1)) for level in (_CUT, 1 - _CUT))
-        ends[axis] = min(own[axis], max(_ROOM * float(slopes[low]), _WIDER * own[axis]))
-        ends[axis + 2] = max(own[axis + 2], min(_ROOM * float(slopes[high]), _WIDER * own[axis + 2]))
+        for side, at, sign in ((axis, low, -1), (axis + 2, high, 1)):
+            most = max(sign * own[side], min(_WIDER * sign * own[side], _STEEP))
+            ends[side] = sign * max(sign * own[side], min(_ROOM * sign * float(slopes[at]), most))
     return [*ends, middle]
 
 

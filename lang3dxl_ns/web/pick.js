@@ -90,7 +90,7 @@ export function bestPhoto(views, points, preferred) {
     let size = 0;
     const pixels = [];
     for (const { point, row } of points) {
-      const k = placeOf(view.rows, row), [x, y, depth] = seenAt(view, point);
+      const k = view.rows.indexOf(row), [x, y, depth] = seenAt(view, point);
       if (k < 0 || !(depth > 0 && x > 0 && x < view.width && y > 0 && y < view.height)) continue;
       pixels.push([x / view.width, y / view.height]);
       size += view.sizes[view.codes[k]];
@@ -102,15 +102,3 @@ export function bestPhoto(views, points, preferred) {
 }
 
 const before = (a, b) => a.find((value, k) => value !== b[k]) < b.find((value, k) => value !== a[k]);
-
-/** Find a row among ascending ones; −1 without it. */
-function placeOf(rows, row) {
-  let low = 0, high = rows.length - 1;
-  while (low <= high) {
-    const middle = (low + high) >> 1;
-    if (rows[middle] === row) return middle;
-    if (rows[middle] < row) low = middle + 1;
-    else high = middle - 1;
-  }
-  return -1;
-}

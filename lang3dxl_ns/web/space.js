@@ -16,22 +16,13 @@ export function freeSpace(views, centers) {
   });
   const step = Math.max(...ends.map(([low, high]) => high - low)) / SIDE, low = ends.map(([first]) => first);
   const sides = ends.map(([first, last]) => Math.max(Math.ceil((last - first) / step), 1)), bits = new Uint8Array(sides[0] * sides[1] * sides[2]);
-  for (const place of places) ball(place, Math.max(around, step), low, step, sides, (i) => (bits[i] = 1));
+  const reach = Math.max(around, step) + step / 2, near = ([x, y, z]) => places.some(([a, b, c]) => (x - a) ** 2 + (y - b) ** 2 + (z - c) ** 2 < reach ** 2);
   for (let i = 0; i < bits.length; i++) {
     const cell = [i % sides[0], Math.floor(i / sides[0]) % sides[1], Math.floor(i / sides[0] / sides[1])];
     const point = cell.map((value, axis) => low[axis] + (value + 0.5) * step);
-    bits[i] ||= some.some((view) => looksThrough(view, point));
+    bits[i] = near(point) || some.some((view) => looksThrough(view, point));
   }
   return { low, step, sides, bits };
-}
-
-/** Visit the cells whose centers lie within a radius of a place. */
-function ball(place, radius, low, step, sides, visit) {
-  const [first, last] = [-radius, radius].map((r) => place.map((value, axis) => Math.max(0, Math.min(Math.floor((value + r - low[axis]) / step), sides[axis] - 1))));
-  for (let z = first[2]; z <= last[2]; z++)
-    for (let y = first[1]; y <= last[1]; y++)
-      for (let x = first[0]; x <= last[0]; x++)
-        if (Math.hypot(...[x, y, z].map((cell, axis) => low[axis] + (cell + 0.5) * step - place[axis])) < radius + step / 2) visit(x + sides[0] * (y + sides[1] * z));
 }
 
 const sorted = (values) => Float32Array.from(values).sort();

@@ -1,11 +1,12 @@
 // Single things out of a word's relevancy, as in Python's things/: pieces of each view, joined by shared Gaussians.
 // Python renders the heat that is cut into pieces; here it is drawn from the pixels that each Gaussian fills.
 import language from "./language.js";
+import { fitted } from "./like.js";
 
 const { LEVELS, PART, DEPTH, FILLED, SHARED, SPLINTER, VIEWS, CRUMB, OFTEN, MOST_SHARED, OUTLIERS, TURNS, COLORED, SAME } = language.things;
 const SIDE = 240, LEAST = 3; // pixels of a view's longer side, and of the smallest piece
 const FAINT = 0.05, TRACE = 0.004, REACH = 2.5, BLUR = 0.3; // relevancy and heat that leave no trace, standard deviations that are drawn, square pixels
-const SHARP = 10, ROUNDS = 12; // inverse strength of the colors' regularization, Newton steps
+const RIDGE = 0.1, ROUNDS = 12; // strength of the colors' regularization, Newton steps
 const DC = 0.28209479177387814; // of spherical harmonics: colors are compared as coefficients
 
 /** Find the things of a word: { things, least, most }, largest first. views: as of find.js; scene: { centers, axes,
@@ -71,9 +72,9 @@ export function sharpened({ centers, bytes, mass, gap }, relevancy) {
   const total = (rows) => rows.reduce((sum, i) => sum + Math.sqrt(mass[i]), 0), all = match.length + around.length;
   const samples = [match, around].flatMap((rows, other) => {
     const share = all / 2 / total(rows);
-    return rows.map((i) => ({ x: color(i), y: 1 - other, w: Math.sqrt(mass[i]) * share }));
+    return rows.map((i) => ({ at: color(i), is: 1 - other, weight: Math.sqrt(mass[i]) * share }));
   });
-  const beta = logistic(samples);
+  const beta = fitted(samples, 4, RIDGE, ROUNDS);
   return relevancy.map((value, i) => (value > FAINT ? value / (1 + Math.exp(-color(i).reduce((sum, x, k) => sum + x * beta[k], 0))) : 0));
 }
 
@@ -93,35 +94,6 @@ function neighborhood(centers, rows, distance) {
         for (let c = -1; c <= 1; c++) if (cells.get(key(x + a, y + b, z + c))?.some(here)) return true;
     return false;
   };
-}
-
-/** Fit a logistic regression by Newton's method; the last coefficient is the intercept. */
-function logistic(samples) {
-  const beta = [0, 0, 0, 0];
-  for (let round = 0; round < ROUNDS; round++) {
-    const slope = beta.map((b, k) => (k < 3 ? b / SHARP : 0)), bend = beta.map((_, k) => beta.map((_, j) => (k === j ? (k < 3 ? 1 / SHARP : 1e-9) : 0)));
-    for (const { x, y, w } of samples) {
-      const p = 1 / (1 + Math.exp(-(x[0] * beta[0] + x[1] * beta[1] + x[2] * beta[2] + beta[3]))), curve = w * p * (1 - p);
-      for (let k = 0; k < 4; k++) {
-        slope[k] += w * (p - y) * x[k];
-        for (let j = 0; j < 4; j++) bend[k][j] += curve * x[k] * x[j];
-      }
-    }
-    solve(bend, slope).forEach((step, k) => (beta[k] -= step));
-  }
-  return beta;
-}
-
-/** Solve a small symmetric positive definite system by elimination. */
-function solve(matrix, right) {
-  const size = right.length, rows = matrix.map((row, k) => [...row, right[k]]);
-  for (let k = 0; k < size; k++)
-    for (let j = 0; j < size; j++) {
-      if (j === k) continue;
-      const share = rows[j][k] / rows[k][k];
-      for (let c = k; c <= size; c++) rows[j][c] -= share * rows[k][c];
-    }
-  return rows.map((row, k) => row[size] / row[k]);
 }
 
 /** Draw a view's heat and depth: what each Gaussian fills, spread over its footprint. */

@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 import torch
 import torch.nn.functional as F
+from pages import DESK, STAND, browser, opened, picture, served
 from painted_scene import painted_looks, painted_scene, painted_splats
-from test_web_page import DESK, browser, opened, picture, served  # noqa: F401
 
 from lang3dxl_ns.rendering import Splats, render
 from lang3dxl_ns.rendering.projection import rotations
@@ -115,7 +115,7 @@ def test_the_finest_level_is_the_scene_and_coarser_ones_answer():
     assert (coarse[(fine.reshape(-1, 4) < 0.1).all(1)] < 0.1).all()
 
 
-def test_a_page_of_chunks_ends_with_the_picture_and_the_heat_of_the_whole(browser, tmp_path):  # noqa: F811
+def test_a_page_of_chunks_ends_with_the_picture_and_the_heat_of_the_whole(browser, tmp_path):
     scene = rough_wall()
     pictures, words = [], []
     for name, large in (("whole", 10_000), ("chunks", MOST)):
@@ -127,6 +127,7 @@ def test_a_page_of_chunks_ends_with_the_picture_and_the_heat_of_the_whole(browse
             if page.levels:
                 tab.evaluate(HELD)
                 tab.wait_for_timeout(500)
+            tab.evaluate(STAND)
             pictures.append(picture(tab))
             words.append(dict(tab.evaluate("lang3dxl.whatIs(192, 192)")))
             assert tab.complaints == []
@@ -148,7 +149,7 @@ ARRIVING = """async () => {
 }"""
 
 
-def test_the_picture_is_sharp_while_detail_arrives_and_numbers_are_of_the_whole(browser, tmp_path):  # noqa: F811
+def test_the_picture_is_sharp_while_detail_arrives_and_numbers_are_of_the_whole(browser, tmp_path):
     scene = rough_wall()
     write_page(Page(scene, large=MOST), tmp_path)
     with served(tmp_path) as address:
@@ -162,7 +163,7 @@ def test_the_picture_is_sharp_while_detail_arrives_and_numbers_are_of_the_whole(
     assert abs(found["matching"] / exact - 1) < 0.2 and card.startswith("About ")
 
 
-def test_a_lighting_reaches_the_details(browser, tmp_path):  # noqa: F811
+def test_a_lighting_reaches_the_details(browser, tmp_path):
     page = Page(painted_scene(looks=painted_looks()), large=MOST)
     write_page(page, tmp_path)
     with served(tmp_path) as address:

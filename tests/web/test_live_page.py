@@ -9,9 +9,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from pages import DESK, browser, opened, rest, served, until, until_linked, until_told
 from painted_scene import CHANNELS, encode_texts, painted_file, painted_scene
 from PIL import Image
-from test_web_page import DESK, SIDE, browser, opened, rest, served, until, until_linked, until_told  # noqa: F401
 
 from lab.baselines.lifting import LiftedFeatures
 from lang3dxl_ns.common.errors import UserError
@@ -148,7 +148,7 @@ def spot(page, scene, x, y):
 
 
 @pytest.mark.slow
-def test_a_photo_lies_exactly_over_the_rendering_and_leaves_with_the_eye(browser, file, photos):  # noqa: F811
+def test_a_photo_lies_exactly_over_the_rendering_and_leaves_with_the_eye(browser, file, photos):
     with live(file, photos) as server:
         page = opened(browser, address_of(server), DESK)
         page.emulate_media(reduced_motion="reduce")
@@ -184,7 +184,7 @@ def test_a_photo_lies_exactly_over_the_rendering_and_leaves_with_the_eye(browser
 
 
 @pytest.mark.slow
-def test_a_word_taught_in_the_page_is_in_the_scenes_file_and_in_the_page(browser, file, photos):  # noqa: F811
+def test_a_word_taught_in_the_page_is_in_the_scenes_file_and_in_the_page(browser, file, photos):
     with live(file, photos) as server:
         page = opened(browser, address_of(server), DESK)
         scene = painted_scene()
@@ -212,7 +212,7 @@ def test_a_word_taught_in_the_page_is_in_the_scenes_file_and_in_the_page(browser
         page.close()
 
 
-def test_a_name_that_is_half_typed_stays_when_an_answer_arrives(browser, file, tmp_path):  # noqa: F811
+def test_a_name_that_is_half_typed_stays_when_an_answer_arrives(browser, file, tmp_path):
     write_page(Page(read_scene(file, "cpu")), tmp_path / "page")
     with served(tmp_path / "page") as address:
         page = opened(browser, address, DESK)
@@ -235,7 +235,7 @@ def test_a_name_that_is_half_typed_stays_when_an_answer_arrives(browser, file, t
 
 
 @pytest.mark.slow
-def test_a_static_page_writes_words_that_the_scene_learns_as_if_marked_there(browser, file, photos, tmp_path):  # noqa: F811
+def test_a_static_page_writes_words_that_the_scene_learns_as_if_marked_there(browser, file, photos, tmp_path):
     scene = read_scene(file, "cpu")
     write_page(Page(scene, photos=photos), tmp_path / "page")
     with served(tmp_path / "page") as address:
@@ -316,7 +316,7 @@ def test_what_is_large_and_floats_before_the_wall_is_hidden_and_left_out(tmp_pat
 
 
 @pytest.mark.slow
-def test_a_misspelled_word_is_offered_where_the_answer_is_not_sure(browser, file):  # noqa: F811
+def test_a_misspelled_word_is_offered_where_the_answer_is_not_sure(browser, file):
     with live(file) as server:
         page = opened(browser, address_of(server), DESK)
         page.evaluate("lang3dxl.ask('windwos')")

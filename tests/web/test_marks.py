@@ -3,12 +3,12 @@
 import json
 
 import numpy as np
-from test_web_page import THINK, browser, camera_of_page, served, tilted_scene  # noqa: F401
+from pages import THINK, browser, camera_of_page, served, tilted_scene
 
 from lang3dxl_ns.web.write_page import Page, write_page
 
 
-def test_a_mark_lies_in_its_photo_where_the_point_of_its_pixel_does(browser, tmp_path):  # noqa: F811
+def test_a_mark_lies_in_its_photo_where_the_point_of_its_pixel_does(browser, tmp_path):
     write_page(Page(tilted_scene()), tmp_path)
     about = json.loads((tmp_path / "scene.json").read_text())
     camera, views = camera_of_page(about["start"], about["center"]), {v["name"]: v for v in about["views"]}

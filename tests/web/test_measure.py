@@ -4,8 +4,8 @@ import re
 from dataclasses import replace
 
 import numpy as np
+from pages import DESK, browser, opened, served, until_linked, until_told
 from painted_scene import painted_file, painted_scene
-from test_web_page import DESK, browser, opened, served, until_linked, until_told  # noqa: F401
 
 from lang3dxl_ns.scene.georeference import Georeference
 from lang3dxl_ns.web.write_page import Page, write_page
@@ -19,7 +19,7 @@ CLICK = """async ([x, y]) => {
 }"""
 
 
-def test_two_clicks_tell_a_distance_in_meters_and_its_height(browser, tmp_path):  # noqa: F811
+def test_two_clicks_tell_a_distance_in_meters_and_its_height(browser, tmp_path):
     meters = Georeference(20.0, (0.0, 1.0, 0.0), (1.0, 0.0, 0.0), 0.03, 5)
     for name, known in (("gps", meters), ("none", None)):
         write_page(Page(painted_scene(file=replace(painted_file(), georeference=known))), tmp_path / name)
@@ -52,7 +52,7 @@ FRAMES = """async () => {
 }"""
 
 
-def test_a_typed_length_sets_the_scale_and_travels_in_the_link(browser, tmp_path):  # noqa: F811
+def test_a_typed_length_sets_the_scale_and_travels_in_the_link(browser, tmp_path):
     write_page(Page(painted_scene()), tmp_path)
     with served(tmp_path) as address:
         tab = opened(browser, address, DESK)
@@ -75,7 +75,7 @@ def test_a_typed_length_sets_the_scale_and_travels_in_the_link(browser, tmp_path
     assert abs(found["width"] / found["unit"] * 30 / units / meters - 1) < 0.02
 
 
-def test_the_arrow_points_north(browser, tmp_path):  # noqa: F811
+def test_the_arrow_points_north(browser, tmp_path):
     meters = Georeference(20.0, (0.0, -1.0, 0.0), (1.0, 0.0, 0.0), 0.03, 5)
     write_page(Page(painted_scene(file=replace(painted_file(), georeference=meters))), tmp_path)
     angles = []

@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
+from pages import DESK, browser, opened, served, until, until_linked
 from painted_scene import painted_scene
-from test_web_page import DESK, browser, opened, served, until, until_linked  # noqa: F401 — browser is a fixture
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.things.find import Things
@@ -30,7 +30,7 @@ SIGHT = Sight(np.array([1.0, 0, 0]), np.array([0, 0, 1.0]), np.array([0, 1.0, 0]
 
 
 @pytest.fixture(scope="module")
-def page(browser, tmp_path_factory):  # noqa: F811
+def page(browser, tmp_path_factory):
     folder = tmp_path_factory.mktemp("page")
     write_page(Page(painted_scene()), folder)
     with served(folder) as address:

@@ -1,9 +1,9 @@
 """A tour on the page: kept views with words and captions, in the link, played in order."""
 
 import pytest
+from pages import DESK, browser, served, until
 from painted_scene import painted_scene
 from test_visits import visit
-from test_web_page import DESK, browser, served, until  # noqa: F401
 
 from lang3dxl_ns.web.write_page import Page, write_page
 
@@ -30,7 +30,7 @@ def address(tmp_path):
         yield found
 
 
-def test_kept_views_travel_in_the_link_and_play_in_order(browser, address):  # noqa: F811
+def test_kept_views_travel_in_the_link_and_play_in_order(browser, address):
     stands = []
     with visit(browser, address, DESK) as page:
         page.evaluate("document.getElementById('tour').open = true")
@@ -63,7 +63,7 @@ HOSTILE = ("stop=%00%ff", "stop=" + "x" * 5000, "stop=stop%3Dview&stop=caption%3
 
 
 @pytest.mark.parametrize("hostile", HOSTILE, ids=range(4))
-def test_a_damaged_tour_opens_and_plays(browser, address, hostile):  # noqa: F811
+def test_a_damaged_tour_opens_and_plays(browser, address, hostile):
     with visit(browser, f"{address}#{hostile}", DESK) as page:
         page.evaluate("lang3dxl.tour.play(1)")
         assert not page.evaluate("document.querySelector('#stops b, #caption b')")

@@ -6,9 +6,9 @@ import tarfile
 from contextlib import contextmanager
 
 import pytest
+from pages import PHONE, browser, prompts_of, served, until
 from painted_scene import painted_scene
 from PIL import Image
-from test_web_page import PHONE, browser, prompts_of, served, until  # noqa: F401
 
 from lang3dxl_ns.web.write_page import Page, write_page
 
@@ -52,7 +52,7 @@ def axe(tmp_path_factory):
 
 
 @contextmanager
-def visit(browser, address, size, script=None, **media):  # noqa: F811
+def visit(browser, address, size, script=None, **media):
     """A page that is ready, with what it complained about."""
     context = browser.new_context(viewport=size, has_touch=size is PHONE, is_mobile=size is PHONE)
     page = context.new_page()
@@ -79,7 +79,7 @@ def tab_to(page, name: str) -> None:
 
 @pytest.mark.slow
 @SIZES
-def test_every_stop_of_the_tabulator_is_seen_named_and_outlined(browser, address, size):  # noqa: F811
+def test_every_stop_of_the_tabulator_is_seen_named_and_outlined(browser, address, size):
     with visit(browser, address, size) as page:
         page.evaluate("lang3dxl.ask('dome; windows')")
         page.evaluate("document.getElementById('more').open = true")
@@ -95,7 +95,7 @@ def test_every_stop_of_the_tabulator_is_seen_named_and_outlined(browser, address
 
 @pytest.mark.slow
 @SIZES
-def test_a_visit_by_keyboard_alone(browser, address, size):  # noqa: F811
+def test_a_visit_by_keyboard_alone(browser, address, size):
     with visit(browser, address, size) as page:
         page.keyboard.press("/")
         page.keyboard.type("dome; windows")
@@ -128,7 +128,7 @@ def test_a_visit_by_keyboard_alone(browser, address, size):  # noqa: F811
 
 
 @pytest.mark.slow
-def test_a_visit_by_touch_alone(browser, address):  # noqa: F811
+def test_a_visit_by_touch_alone(browser, address):
     with visit(browser, address, PHONE) as page:
         tap = lambda name, **how: page.get_by_role("button", name=name, exact=True, **how).first.tap()  # noqa: E731
         tap("windows")  # a suggestion
@@ -160,7 +160,7 @@ def test_a_visit_by_touch_alone(browser, address):  # noqa: F811
 
 @pytest.mark.slow
 @SIZES
-def test_forced_colors_keep_the_colors_that_tell_prompts_apart(browser, address, size):  # noqa: F811
+def test_forced_colors_keep_the_colors_that_tell_prompts_apart(browser, address, size):
     with visit(browser, address, size, forced_colors="active") as page:
         page.evaluate("lang3dxl.ask('dome; windows')")
         cards = page.evaluate("""[...document.querySelectorAll("#prompts li")].map((card) => [
@@ -173,7 +173,7 @@ def test_forced_colors_keep_the_colors_that_tell_prompts_apart(browser, address,
 
 @pytest.mark.slow
 @SIZES
-def test_axe_finds_nothing(browser, address, axe, size):  # noqa: F811
+def test_axe_finds_nothing(browser, address, axe, size):
     run = """axe.run().then(({ violations }) =>
       violations.map(({ id, nodes }) => [id, nodes.map(({ html }) => html)]))"""
     with visit(browser, address, size, axe) as page:

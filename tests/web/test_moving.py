@@ -1,0 +1,213 @@
+"""Moving in the page: walking, orbiting, limits, cameras, and pictures that keep up."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from pages import (
+    DESK,
+    PHONE,
+    PRESS,
+    SIDE,
+    address,
+    browser,
+    desk,
+    opened,
+    page,
+    picture,
+    rest,
+    scene,
+    served,
+    until_told,
+)
+from painted_scene import (
+    painted_file,
+    painted_scene,
+)
+
+from lang3dxl_ns.web.write_page import Page, write_page
+
+
+@pytest.mark.slow
+def test_cameras_are_drawn_and_doubtful_ones_apart_with_their_reason(browser, tmp_path):
+    file = painted_file()
+    photos = [
+        replace(photo, doubtful="it looks away" if k == 1 else None) for k, photo in enumerate(file.photos)
+    ]
+    write_page(Page(painted_scene(file=replace(file, photos=photos))), tmp_path)
+    with served(tmp_path) as address:
+        page = opened(browser, address, DESK)
+        page.evaluate("lang3dxl.view.mover.free = true")
+        for _ in range(12):
+            page.locator("#frame").press("s")  # until the cameras stand before the eye
+        page.get_by_role("button", name="Cameras").click()
+        drawn = (
+            "(kind) => document.querySelector(`#pyramids .${kind}`).getAttribute('d').split('M').length - 1"
+        )
+        rest(page)
+        assert [page.evaluate(drawn, kind) for kind in ("sure", "doubtful")] == [8, 4]  # edges
+        page.get_by_role("button", name="Next view").click()
+        page.get_by_role("button", name="Next view").click()
+        until_told(page, "#status", "doubtful: it looks away")
+        page.close()
+
+
+@pytest.mark.slow
+def test_a_slow_machine_draws_drafts_until_nothing_changes(page):
+    picture(page)
+    width = page.evaluate("document.querySelector('#frame canvas').width")
+    draft = page.evaluate("""async () => {
+      lang3dxl.view.cost = 8e3;  // a draft for two seconds
+      lang3dxl.view.wake();
+      await new Promise(requestAnimationFrame);
+      await new Promise(requestAnimationFrame);
+      return document.querySelector("#frame canvas").width;
+    }""")
+    assert draft == pytest.approx(0.3 * width, abs=1)
+    rest(page)
+    assert page.evaluate("document.querySelector('#frame canvas').width") == width == SIDE
+
+
+@pytest.mark.slow
+def test_one_walks_looks_and_orbits_by_keys(page):
+    stand = """() => { const { position, target } = lang3dxl.view.mover.stand;
+      return [position.toArray(), target.toArray()]; }"""
+    page.evaluate("lang3dxl.view.mover.free = true")
+
+    def after(key):
+        before = np.array(page.evaluate(stand))
+        page.locator("#frame").press(key)
+        return before, np.array(page.evaluate(stand))
+
+    before, now = after("ArrowLeft")  # around the target
+    assert np.allclose(before[1], now[1]) and not np.allclose(before[0], now[0])
+    up = np.array(page.evaluate("lang3dxl.view.camera.up.toArray()"))
+    for key, axis in (
+        ("w", "ahead"),
+        ("s", "back"),
+        ("a", "left"),
+        ("d", "right"),
+        ("e", "up"),
+        ("q", "down"),
+    ):
+        before, now = after(key)
+        way, ahead = now[0] - before[0], before[1] - before[0]
+        assert np.allclose(now[1] - now[0], ahead, atol=1e-4)  # the view stays
+        level = ahead - up * (ahead @ up)
+        right = np.cross(level, up)
+        aim = {"ahead": level, "back": -level, "left": -right, "right": right, "up": up, "down": -up}[axis]
+        assert way @ aim > 0.99 * np.linalg.norm(way) * np.linalg.norm(aim) > 0
+    before, now = after("ArrowRight")  # walking, arrows look
+    assert np.allclose(before[0], now[0]) and not np.allclose(before[1], now[1])
+    page.evaluate("lang3dxl.view.mover.free = false")
+    page.locator("button[aria-pressed=true]", has_text="Walk").wait_for()
+
+
+@pytest.mark.slow
+def test_the_eye_stays_before_the_wall_unless_shift_is_held(page):
+    for _ in range(100):
+        page.wait_for_timeout(100)
+        if page.evaluate("Boolean(lang3dxl.view.mover.space)"):
+            break
+    depth = "lang3dxl.view.mover.camera.position.z"  # the wall is z = 0
+    for _ in range(40):
+        page.locator("#frame").press("w")
+    near = page.evaluate(depth)
+    assert -2.5 < near < 0
+    until_told(page, "#status", "hold Shift")
+    for _ in range(40):
+        page.locator("#frame").press("Shift+W")
+    assert page.evaluate(depth) > 0.5
+    page.get_by_role("button", name="Overview").click()
+    page.locator("button[aria-pressed=false]", has_text="Walk").wait_for()
+
+
+@pytest.mark.slow
+def test_a_double_click_turns_around_what_is_there(page, scene):
+    camera = scene.overview.full_camera
+    x, y, z = camera.intrinsics.numpy() @ camera.view_matrix[:3].numpy() @ [1.5, 1.5, 0, 1]
+    corner = page.locator("#frame canvas").bounding_box()
+    page.emulate_media(reduced_motion="reduce")
+    page.mouse.dblclick(corner["x"] + SIDE * x / z / camera.width, corner["y"] + SIDE * y / z / camera.width)
+    for _ in range(50):
+        page.wait_for_timeout(100)
+        target = page.evaluate("lang3dxl.view.mover.stand.target.toArray()")
+        if abs(target[0] - 1.5) < 0.15:
+            break
+    np.testing.assert_allclose(target, [1.5, 1.5, 0], atol=0.15)
+
+
+@pytest.mark.slow
+def test_with_two_fingers_one_walks_and_with_one_one_looks(browser, address):
+    page = opened(browser, address, PHONE)
+    page.get_by_role("button", name="Walk").click()
+    drag = """(fingers) => {
+      const canvas = document.querySelector("#frame canvas"), before = lang3dxl.view.mover.stand;
+      const send = (kind, id, x, y) => canvas.dispatchEvent(new PointerEvent(kind,
+        { pointerId: id, pointerType: "touch", isPrimary: id === 1, clientX: x, clientY: y, bubbles: true }));
+      canvas.setPointerCapture = () => {};
+      for (let id = 1; id <= fingers; id++) send("pointerdown", id, 100 + 50 * id, 200);
+      for (let id = 1; id <= fingers; id++) send("pointermove", id, 100 + 50 * id, 240);
+      for (let id = 1; id <= fingers; id++) send("pointerup", id, 100 + 50 * id, 240);
+      const now = lang3dxl.view.mover.stand;
+      return [now.position.distanceTo(before.position), now.target.clone().sub(now.position)
+        .angleTo(before.target.clone().sub(before.position))];
+    }"""
+    page.evaluate("lang3dxl.view.mover.free = true")
+    moved, turned = page.evaluate(drag, 1)
+    assert moved < 1e-6 and turned > 0.05
+    moved, turned = page.evaluate(drag, 2)
+    assert moved > 1e-3 and turned < 1e-4
+    page.close()
+
+
+@pytest.mark.slow
+def test_shortcuts_of_the_browser_do_not_steer(page):
+    steered = f"""[{{ ctrlKey: true }}, {{ metaKey: true }}, {{ altKey: true }}, {{}}].map((held) =>
+      !{PRESS}("-", held) || !{PRESS}("ArrowLeft", held))"""
+    assert page.evaluate(steered) == [False, False, False, True]
+
+
+@pytest.mark.slow
+def test_a_lost_picture_comes_back(page):
+    page.evaluate("lang3dxl.ask('dome')")
+    before = picture(page)
+    page.evaluate("""async () => {
+      window.loss = lang3dxl.view.renderer.getContext().getExtension("WEBGL_lose_context");
+      lang3dxl.view.wake();
+      await new Promise(requestAnimationFrame);
+      loss.loseContext();
+      lang3dxl.view.wake();
+    }""")
+    page.wait_for_timeout(500)
+    page.evaluate("loss.restoreContext()")
+    assert np.abs(picture(page) - before).max() <= 2
+
+
+@pytest.mark.slow
+def test_an_overview_fits_every_window_below_its_buttons(page):
+    overview = """([extent, clientWidth, clientHeight]) => {
+      const { mover, about } = lang3dxl.view, before = [about.extent, mover.frame];
+      [about.extent, mover.frame] = [extent, { clientWidth, clientHeight }];
+      const { position, target, fov } = mover.overviewStand();
+      [about.extent, mover.frame] = before;
+      return [position.toArray(), target.toArray(), fov, about.up, about.start.pose];
+    }"""
+    for extent in ([-0.5, -0.4, 0.5, 0.3, 5], [-0.2, -0.6, 0.3, 0.1, 5], [-0.9, -0.3, 0.9, 0.3, 5]):
+        for wide, high in ((1100, 900), (390, 422), (500, 390), (390, 844)):
+            found = page.evaluate(overview, [extent, wide, high])
+            place, target, fov, up, pose = (np.array(values) for values in found)
+            np.testing.assert_allclose(place, pose[:3, 3])  # what is farther back, no photo shows from behind
+            ahead = (target - place) / np.linalg.norm(target - place)
+            right = np.cross(ahead, up) / np.linalg.norm(np.cross(ahead, up))
+            left, top, end, bottom, _ = extent
+            ways = (
+                np.array([[left, 0, 1], [end, 0, 1], [0, top, 1], [0, bottom, 1]])
+                * [1, -1, -1]
+                @ pose[:3, :3].T
+            )
+            slopes = ways @ np.stack([right, np.cross(ahead, right)], axis=1) / (ways @ ahead)[:, None]
+            pixels = slopes * high / 2 / np.tan(np.radians(fov) / 2) + [wide / 2, high / 2]
+            inside = -0.03 * wide <= pixels[0, 0] < pixels[1, 0] <= 1.03 * wide
+            assert inside or fov == 110, (extent, wide, high)  # a wider lens shows more of what is above and below
+            assert 50 <= pixels[2, 1] < pixels[3, 1] <= high - 50, (extent, wide, high)

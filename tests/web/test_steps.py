@@ -1,0 +1,126 @@
+"""Undo, Redo, Escape and addresses of the page: nothing is lost, and a link shows what one sees."""
+
+import numpy as np
+import pytest
+from pages import (
+    DESK,
+    SIDE,
+    address,
+    browser,
+    desk,
+    opened,
+    page,
+    picture,
+    prompts_of,
+    scene,
+    until,
+    until_linked,
+)
+
+
+@pytest.mark.slow
+def test_escape_closes_and_deletes_nothing(page):
+    page.evaluate("lang3dxl.ask('dome; windows')")
+    page.get_by_role("button", name="Teach a word").click()
+    page.get_by_text("Click on it in the view").wait_for()
+    box = page.get_by_role("combobox", name="Look for")
+    box.fill("wal")
+    for where in ("#word", "#frame", "#frame", "#overview", "#frame"):
+        page.locator(where).press("Escape")
+    page.get_by_text("Click on it in the view").wait_for(state="detached")
+    assert prompts_of(page) == ["dome", "windows"] and box.input_value() == "wal"
+    box.fill("")
+    page.evaluate(
+        "Promise.all([lang3dxl.ask('wall'), lang3dxl.clear()])"
+    )  # the running answer is dropped too
+    until_linked(page, "ask=", False)
+    assert prompts_of(page) == []
+
+
+@pytest.mark.slow
+def test_every_step_is_undone_and_redone_by_buttons_keys_and_the_browser(page):
+    page.evaluate("lang3dxl.ask('dome')")
+    page.evaluate("lang3dxl.ask('windows')")
+    slider = page.get_by_label("Threshold of dome")
+    slider.evaluate("""(slider) => { slider.value = 0.8;
+      for (const kind of ["input", "change"]) slider.dispatchEvent(new Event(kind, { bubbles: true })); }""")
+    page.get_by_role("button", name="Remove windows").click()
+    told = "lang3dxl.prompts.map(({ text, threshold }) => text + threshold.toFixed(1)).join()"
+    until(page, told, "dome0.8")
+    until_linked(page, "at=0.8")
+    before = ["dome0.8,windows0.3", "dome0.3,windows0.3", "dome0.3", ""]
+    low = page.evaluate("lang3dxl.ask('dome').then(({ threshold }) => threshold.toFixed(1))")
+    assert low == "0.8"  # asked again, a prompt keeps its threshold
+    page.get_by_role("button", name="Undo").click()
+    until(page, told, before[0])
+    page.locator("#frame").press("Control+z")
+    until(page, told, before[1])
+    page.go_back()
+    until(page, told, before[2])
+    page.go_back()
+    until(page, told, before[3])
+    for shown in before[-2::-1]:
+        page.locator("#frame").press("Control+Shift+z")
+        until(page, told, shown)
+    page.get_by_role("button", name="Redo").click()
+    until(page, told, "dome0.8")
+
+
+@pytest.mark.slow
+def test_a_link_carries_thresholds_colors_and_moving(page, browser, address):
+    page.evaluate("lang3dxl.ask('dome; windows')")
+    page.evaluate("""() => {
+      const slider = document.querySelector("#prompts li:last-child input[type=range]");
+      slider.value = 0.77;
+      for (const kind of ["input", "change"]) slider.dispatchEvent(new Event(kind, { bubbles: true }));
+    }""")
+    page.get_by_role("button", name="Walk").click()
+    page.get_by_role("button", name="Remove dome").click()
+    until(page, "lang3dxl.prompts.length", 1)
+    told = """[lang3dxl.prompts.map(({ text, threshold, color }) => [text, threshold, color]),
+      lang3dxl.view.mover.walking, lang3dxl.view.mover.address]"""
+    shown = page.evaluate(told)
+    for part in ("at=0.77", "walk=1"):
+        until_linked(page, part)
+    until_linked(page, "dome", False)
+    other = opened(browser, page.url, DESK)
+    until(other, told, shown)
+    assert shown[0][0][1] == 0.77
+    other.close()
+    page.get_by_role("button", name="Walk").click()
+
+
+@pytest.mark.slow
+def test_of_two_addresses_the_later_one_is_shown(page):
+    page.evaluate("location.hash = 'ask=windows&ask=wall&ask=belfry&not=sky'")
+    page.evaluate("location.hash = 'ask=dome'")
+    until_linked(page, "ask=%22dome%22")  # the page's own spelling: it has answered
+    page.wait_for_timeout(1500)
+    assert prompts_of(page) == ["dome"] and "ask=%22dome%22" in page.url and "wall" not in page.url
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("text", ["window%3B", "ask=window&ask=", "a" + "%20" * 32_000 + "b", "%22a", "not+"])
+def test_a_link_of_any_length_opens_at_once_with_at_most_twenty_prompts(page, text):
+    page.evaluate(f"location.hash = 'ask=' + {text!r}.repeat({text!r}.length > 99 ? 1 : 10000)")
+    until(page, "document.querySelectorAll('#prompts > *').length < 21")
+    assert page.evaluate("lang3dxl.ask('dome')")["known"]  # the page answers again
+    assert len(prompts_of(page)) <= 21
+
+
+@pytest.mark.slow
+def test_flying_leads_to_the_best_view_and_its_link_back_to_it(page, scene, browser, address):
+    page.evaluate("lang3dxl.ask('windows')")
+    page.get_by_role("button", name="Fly to").click()
+    there = picture(page)
+    until_linked(page, "ask=")
+    until_linked(page, "view=")
+    link = page.url
+    page.evaluate("lang3dxl.clear()")
+    best = scene.render(scene.find("windows").views[0].name, size=SIDE).pixels.astype(int)
+    assert np.abs(picture(page) - best).mean() < 6
+    other = opened(browser, link, DESK)  # two pages at once
+    until(other, "lang3dxl.prompts.map(({ text }) => text).join()", "windows")
+    assert np.abs(picture(other) - there).mean() < 3
+    assert other.complaints == []
+    other.close()
