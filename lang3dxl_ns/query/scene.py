@@ -25,14 +25,13 @@ from lang3dxl_ns.files.splat_file import write_matching, write_splats
 from lang3dxl_ns.preparation.encoders import load_image_text_encoder
 from lang3dxl_ns.query import answer
 from lang3dxl_ns.query.answering import Place
-from lang3dxl_ns.query.doubt import DOUBTFUL, Doubts, doubtful, peaks
+from lang3dxl_ns.query.doubt import DOUBTFUL, Doubts, doubtful, match_thresholds, matching, peaks
 from lang3dxl_ns.query.engine import QueryEngine, make_engine
 from lang3dxl_ns.query.floaters import FLOATS, floating
 from lang3dxl_ns.query.match import Found, Match, View
 from lang3dxl_ns.query.question import QueryConfig, Question
 from lang3dxl_ns.query.relevancy import Queries
 from lang3dxl_ns.query.text import EncodeTexts, Prompt, TextEncoder, listed_phrases, parse_prompts, texts_of
-from lang3dxl_ns.query.thresholds import match_thresholds, matching
 from lang3dxl_ns.query.trust import ANCHORS, alike, foreignness, judged
 from lang3dxl_ns.query.visibility import VisibleGaussians, measured, median_distance, total_pixels
 from lang3dxl_ns.query.vocabulary import closest_word, common_words, searched, shipped_vocabulary
@@ -40,6 +39,7 @@ from lang3dxl_ns.rendering import Rendering, Splats, composite
 from lang3dxl_ns.rendering.gathering import filled_pixels
 from lang3dxl_ns.scene.camera import Camera, posed, resized, with_field_of_view, with_longer_side
 from lang3dxl_ns.scene.record import ScenePhoto, SceneRecord, overview, same_clip
+from lang3dxl_ns.things.find import Things, things_of
 from lang3dxl_ns.words.taught_words import Example, TaughtWord, known_word
 from lang3dxl_ns.words.teach import carried_word, learned_word, least_certain_photo
 
@@ -459,6 +459,10 @@ class Scene:
         """
         words = shipped_vocabulary() if words is None else texts_of(words, "a word")
         return answer.words_at(self, self.camera(place, size), x, y, words, most)
+
+    def things(self, texts: str | Sequence[str]) -> list[Things]:
+        """Find the single things that each prompt names: windows, portals, towers. See `things_of`."""
+        return things_of(self, texts)
 
     # ── words taught by example ─────────────────────────────────────────────────────────────────────
 

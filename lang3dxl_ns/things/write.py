@@ -20,8 +20,7 @@ from lang3dxl_ns.files.splat_file import write_splats
 from lang3dxl_ns.query.heat_maps import PROMPT_COLORS
 from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.things.find import Things, up_of
-from lang3dxl_ns.things.grammar import Sight, holds
-from lang3dxl_ns.things.sight import sight_of
+from lang3dxl_ns.things.grammar import Sight, holds, sight_of
 from lang3dxl_ns.things.thing import Thing
 
 SIDES = {"left": "left_of", "right": "right_of", "above": "above", "below": "below"}
@@ -36,7 +35,10 @@ def write_catalog(scene: Scene, answers: Sequence[Things], folder: Path) -> None
     things = _each_once(answers)
     up = up_of(scene)
     graph = _relations(things, sight_of(scene, things))
-    words, place = [_summary(one) for one in answers], scene.file.georeference
+    words = [{"word": one.word, "count": len(one.things), "least": one.least, "most": one.most,
+              "caution": one.caution, "things": [thing.id for thing in one.things]}
+             for one in answers]  # fmt: skip
+    place = scene.file.georeference
     meters = [None if place is None else (place.meters * t.size).round(2).tolist() for t in things]
     listed = [t.as_json() | {"meters": size} for t, size in zip(things, meters, strict=True)]
     content = {"words": words, "things": listed, "relations": graph, "up": up.tolist()}
@@ -70,11 +72,6 @@ def _relations(things: Sequence[Thing], view: Sight) -> list[list[int | str]]:
     return graph
 
 
-def _summary(one: Things) -> dict[str, Any]:
-    numbers = {"count": len(one.things), "least": one.least, "most": one.most}
-    return {"word": one.word, **numbers, "caution": one.caution, "things": [thing.id for thing in one.things]}
-
-
 def coco(scene: Scene, answers: Sequence[Things]) -> dict[str, Any]:
     """Return the boxes of all things in all photos that show them, as COCO instances."""
     numbers = {photo.name: i + 1 for i, photo in enumerate(scene.photos)}
@@ -96,7 +93,7 @@ def coco(scene: Scene, answers: Sequence[Things]) -> dict[str, Any]:
 def write_picture(scene: Scene, answers: Sequence[Things], path: Path) -> None:
     """Draw numbered boxes on the rendering of the photo that shows most of the things."""
     shown = [
-        (i, n + 1, s) for i, one in enumerate(answers) for n, t in enumerate(one.things) for s in t.sightings
+        (i, n, s) for i, one in enumerate(answers) for n, t in enumerate(one.things, 1) for s in t.sightings
     ]
     if not shown:
         return
@@ -130,8 +127,5 @@ def write_things(scene: Scene, answers: Sequence[Things], folder: Path, look: st
 
 
 def _each_once(answers: Sequence[Things]) -> list[Thing]:
-    things: dict[int, Thing] = {}
-    for one in answers:
-        for thing in one.things:
-            things.setdefault(thing.id, thing)
-    return list(things.values())
+    every = [thing for one in answers for thing in one.things]
+    return [thing for i, thing in enumerate(every) if thing.id not in {other.id for other in every[:i]}]
