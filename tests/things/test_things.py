@@ -199,7 +199,7 @@ def test_the_catalog_has_meters_where_the_scene_has_them(known, tmp_path):
     place = Georeference(2.5, (0.0, -1.0, 0.0), (0.0, 0.0, 1.0), 0.05, 7) if known else None
     scene = painted_scene(file=replace(painted_file(), georeference=place))
     one = thing(3, "window", (0, 0, 0), (1, 2, 4))
-    write_catalog(scene, [Things("window", [one], 1, 1)], tmp_path)
+    write_catalog(scene, [Things("window", [one], [])], tmp_path)
     catalog = json.loads((tmp_path / "things.json").read_text())
     assert catalog["things"][0]["meters"] == ([2.5, 5.0, 10.0] if known else None)
     assert (catalog["unit"] or {}).get("meters") == (2.5 if known else None)
