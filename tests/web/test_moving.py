@@ -213,5 +213,5 @@ def test_an_overview_fits_every_window_below_its_buttons(page):
                 extent,
                 wide,
                 high,
-            )  # a wider lens shows more of what is above and below
+            )  # else a wider lens shows all
             assert 50 <= pixels[2, 1] < pixels[3, 1] <= high - 50, (extent, wide, high)
