@@ -268,20 +268,6 @@ def test_configs(settings_of_a_run, tmp_path, data):
 # ── files that people hand on ───────────────────────────────────────────────────────────────────────────
 
 
-@st.composite
-def altered(draw, value):
-    """A value of JSON with one value within it replaced by another, or removed."""
-    inner = list(value) if isinstance(value, dict) else range(len(value)) if isinstance(value, list) else ()
-    if not inner or draw(st.integers(0, 7)) == 0:
-        return draw(JSON)
-    key, changed = draw(st.sampled_from(inner)), value.copy()
-    if draw(st.integers(0, 3)) == 0:
-        del changed[key]
-    else:
-        changed[key] = draw(altered(value[key]))
-    return changed
-
-
 MASK = {"size": [4, 5], "counts": [3, 4, 13]}
 EXAMPLE = {"photo": "a.jpg", "points": [[1, 2]], "not_points": [], "size": [50, 40], "mask": MASK}
 VALUES = {"bias": 0.1, "text": 0.2, "doubt": 0.05, "vector": [0.5, 0.5], "precision": {"a.jpg": 0.5}}
