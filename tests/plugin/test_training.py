@@ -202,8 +202,10 @@ def test_regions_are_a_loss_where_they_are_asked_for_and_nothing_at_all_elsewher
 def test_the_mask_bounds_the_region_loss_and_as_published_not_the_dense_one(train, scene, tmp_path):
     """Labels that differ only outside the mask, the left half, give the same loss; queries see the mask."""
     for path in (scene / "images").iterdir():
-        mask = Image.new("L", (8, 6), 0)
-        mask.paste(255, (4, 0, 8, 6))
+        with Image.open(path) as photo:
+            width, height = photo.size
+        mask = Image.new("L", (width, height), 0)
+        mask.paste(255, (width // 2, 0, width, height))
         (tmp_path / "right").mkdir(exist_ok=True)
         mask.save(tmp_path / "right" / f"{path.stem}.png")
     options = {"regions": "felzenszwalb", "foreground": str(tmp_path / "right")}
