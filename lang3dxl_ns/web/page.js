@@ -13,7 +13,7 @@ import { Tour } from "./tour.js";
 import { parsePrompts, tidy } from "./vocabulary.js";
 import { View } from "./view.js";
 
-const TYPING = 500, MOST_TRIED = 6, TIE = 0.02; // milliseconds until negatives take effect; suggested words; relevancies that tell words apart
+const TYPING = 500, MOST_TRIED = 6, TIE = 0.02, HALF = "50"; // milliseconds until negatives take effect; suggested words; relevancies that tell words apart; how many floaters a page hides at first
 const $ = (id) => document.getElementById(id);
 const prompts = [], taughtHere = new Set(); // names that were taught to the server's scene from here
 let about, view, photos, list, tour, steps, kept, latest = null, settled = false, cleared = 0; // settled: the address has been read; cleared: how often all prompts were removed
@@ -391,7 +391,7 @@ function asField(prompt) {
 const shownNow = (stops = tour.fields) =>
   written({
     stops,
-    view: view.mover.address, walk: view.mover.walking ? 1 : "", not: $("not").value, hide: Number($("hide").value) || "", look: chosenLook,
+    view: view.mover.address, walk: view.mover.walking ? 1 : "", not: $("not").value, hide: $("hide").value === HALF ? "" : $("hide").value, look: chosenLook,
     unit: about.unit, cameras: $("cameras").ariaPressed === "true" ? 1 : "", photo: photos.shown?.name, ...list.fields,
     prompts: prompts.filter(({ examples }) => !examples || examples.length).map(asField),
   }); // prettier-ignore
@@ -413,7 +413,7 @@ async function apply(hash, turn = drop(), isStop = false) {
   view.mover.walk(wanted.walk === "1");
   if (!isStop) about.unit = Number(wanted.unit) > 0 && Number.isFinite(Number(wanted.unit)) ? Number(wanted.unit) : null;
   $("cameras").ariaPressed = String(wanted.cameras === "1");
-  $("hide").value = Number(wanted.hide) || 0;
+  $("hide").value = wanted.hide ?? HALF;
   hideFloaters();
   attempt(() => chooseLook(wanted.look ?? ""));
   const common = $("not").value !== (wanted.not ?? "");
@@ -646,7 +646,6 @@ async function begin() {
   if (about.words) setTimeout(() => think("space").then((space) => (view.mover.space = space))); // behind the prompts
   setTimeout(() => attempt(readFloaters));
   if (about.detail) new Detail(about, view, think, { read: fetched, question, failed: (error) => say(error.message) });
-  if (about.hide) $("hide").value = 50;
   if (location.hash.length > 1) return apply(location.hash, turn);
   for (const [text, ...negatives] of about.prompts) if (turn === cleared) await ask(asTyped({ text, negatives }), turn);
   if (turn === cleared) settle("");
