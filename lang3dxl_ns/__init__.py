@@ -18,7 +18,6 @@ _PUBLIC = {
     "Found": "query.match",
     "train": "training.fit",
     "reconstruct": "scene.reconstruct:reconstruct_scene",
-    "things_of": "things.find",
     "rasterize": "rendering",
     "UserError": "common.errors",
 }

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import sys
-from copy import deepcopy
-from pathlib import Path
 from typing import Literal
 
 import torch
@@ -16,6 +14,7 @@ from lang3dxl_ns.plugin.optimizers import parameter_groups
 from lang3dxl_ns.plugin.pipeline import Lang3DXLPipelineConfig
 from lang3dxl_ns.plugin.run_settings import check_command_line
 from lang3dxl_ns.plugin.trainer_config import Lang3DXLTrainerConfig
+from lang3dxl_ns.plugin.wrong_flags import name_wrong_flags
 from lang3dxl_ns.training.learning_rates import Rates, learning_rates, printed_learning_rates
 from lang3dxl_ns.training.settings import PRINTED_PHOTO_SCALE, as_printed
 
@@ -62,23 +61,4 @@ lang3dxl_paper = MethodSpecification(
 METHODS = {"lang3dxl": lang3dxl, "lang3dxl-paper": lang3dxl_paper}
 if sys.argv[1:2] and sys.argv[1] in METHODS:
     sys.argv[2:] = asked_for_all(sys.argv[2:])
-
-
-def run_config(
-    data: Path,
-    output_dir: Path,
-    experiment_name: str,
-    iterations: int,
-    clip: str,
-    dense: str,
-    method: str = "lang3dxl",
-) -> Lang3DXLTrainerConfig:
-    """Build the configuration for training inside another command, without viewer or interim evaluation."""
-    config = deepcopy(METHODS[method].config)
-    assert isinstance(config, Lang3DXLTrainerConfig)
-    config.data = config.pipeline.datamanager.data = data
-    config.output_dir, config.experiment_name = output_dir, experiment_name
-    config.vis, config.steps_per_eval_image = "tensorboard", 0
-    config.max_num_iterations = iterations
-    config.pipeline.datamanager.clip, config.pipeline.datamanager.dense = clip, dense
-    return config
+    name_wrong_flags(METHODS[sys.argv[1]].config)

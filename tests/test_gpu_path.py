@@ -19,8 +19,9 @@ from lab.baselines import BASELINES, langsplat
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.components.compression import CompressedField
 from lang3dxl_ns.open_scene import load_scene
-from lang3dxl_ns.training import estimate, gaussians
-from lang3dxl_ns.training.step import decoded_side
+from lang3dxl_ns.scene.capture import open_capture
+from lang3dxl_ns.training import estimate, fit, gaussians
+from lang3dxl_ns.training.step import decoded_side, losses
 
 pytestmark = pytest.mark.nerfstudio
 
@@ -151,6 +152,26 @@ def test_mixed_precision_is_bfloat16_without_a_scale_where_the_gpu_has_it(traine
     assert trainer.grad_scaler.is_enabled() is (capability < (8, 0))
     wanted = torch.float16 if capability < (8, 0) else torch.bfloat16
     assert torch.get_autocast_dtype("cuda") == wanted
+
+
+@pytest.mark.parametrize("mixed", [False, True])
+def test_a_step_without_nerfstudio_is_in_mixed_precision_if_that_is_wanted(
+    gpu, small, tiny_clip, tiny_dense, tmp_path, monkeypatch, mixed
+):
+    seen = []
+
+    def noted(*arguments):
+        seen.append(torch.is_autocast_enabled("cuda") and torch.get_autocast_dtype("cuda"))
+        return losses(*arguments)
+
+    monkeypatch.setattr(fit, "losses", noted)
+    settings = fit.Settings.of("lang3dxl", 2)
+    settings.targets.clip, settings.targets.dense = str(tiny_clip), str(tiny_dense)
+    settings.scene.sky_gaussians, settings.mixed_precision = 40, mixed
+    with gpu():
+        run = fit.begin(open_capture(small), settings, tmp_path / "run", tmp_path / "cache", "cuda")
+        run.iterate(0)
+    assert seen == [torch.bfloat16 if mixed else False]
 
 
 def test_cudnn_does_not_tune_for_every_size(default):

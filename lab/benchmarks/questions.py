@@ -3,21 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from jaxtyping import Float
+from numpy import ndarray as Array
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.things.find import Things
-from lang3dxl_ns.things.grammar import Request, Sight, answer, measure, parse, table, unsure
-from lang3dxl_ns.things.sight import sight_of
+from lang3dxl_ns.things.grammar import Request, Sight, answer, measure, parse, sight_of, table, unsure
 from lang3dxl_ns.things.thing import Thing
 
 MOST = 200
 """Questions per landmark."""
 TIE = 0.1
-"""Difference, relative to the true answer's size, up to which another thing is as high, large or far left."""
+"""Relative difference of two sizes up to which they are as large."""
+NEAR = 0.3
+"""Distance, relative to a thing's longest edge, within which its place decides nothing: half of what a thing
+may be off and still count as found. Who is first within it is a tie; what holds on one side of it only may
+be in a list or not."""
 _RELATIONS = ("left of", "right of", "above", "below", "next to", "in front of", "behind")
 _PLACES = ("first", "second", "third", "fourth")
 
@@ -31,7 +36,8 @@ class Outcome:
     cautious: bool
     """Whether the answer came with a caution, a range that holds the truth, or a refusal."""
     right_if_found: bool
-    """Whether it is right about the true things that were found: those that were missed don't count."""
+    """Whether it is right about the true things that were found: neither those that were missed count nor
+    false ones."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,13 +52,18 @@ class Known:
 
     @property
     def truth(self) -> Things:
-        return Things(self.found.word, self.true, len(self.true), len(self.true))
+        return Things(self.found.word, self.true)
+
+    @property
+    def true_ones(self) -> Things:
+        """The things found that are true ones."""
+        return Things(self.found.word, [thing for thing in self.found.things if self.matches.get(thing)])
 
     @property
     def seen(self) -> Things:
         """The true things that were found."""
         true = [thing for thing in self.true if thing in self.matches.values()]
-        return Things(self.found.word, true, len(true), len(true))
+        return Things(self.found.word, true)
 
 
 def questions(words: Sequence[str]) -> list[str]:
@@ -85,18 +96,18 @@ def ask_all(scene: Scene, known: Mapping[str, Known]) -> list[Outcome]:
 def _outcome(
     text: str, request: Request, view: Sight, known: Mapping[str, Known], truth: list[Thing]
 ) -> Outcome:
-    asked = known[request.word]
-    given = _answer(request, [one.found for one in known.values()], view)
-    seen = _answer(request, [one.seen for one in known.values()], view)
-    named = [known[word].found for word in request.words]
-    caution = given is None or any(one.caution for one in named)
+    asked, found = known[request.word], [one.found for one in known.values()]
+    given = _answer(request, found, view)
+    caution = given is None or any(known[word].found.caution for word in request.words)
     if request.count:
-        ranged = asked.found.least <= len(truth) <= asked.found.most
-        count, least = len(given or []), len(seen or [])
-        return Outcome(text, count == len(truth), caution or ranged, count == least)
-    caution |= unsure(request, named) is not None
-    right = [_is_right(request, view, asked, given, wanted) for wanted in (truth, seen)]
-    return Outcome(text, right[0], caution, right[1])
+        count, least, most = len(asked.found.things), asked.found.least, asked.found.most
+        ranged = least < most and least <= len(truth) <= most
+        return Outcome(text, count == len(truth), caution or ranged, len(asked.seen.things) == len(truth))
+    caution |= unsure(request, found, lambda _: view) is not None
+    true = _answer(request, [one.true_ones for one in known.values()], view)
+    right = _is_right(request, view, asked, given, [one.truth for one in known.values()])
+    right_if_found = _is_right(request, view, asked, true, [one.seen for one in known.values()])
+    return Outcome(text, right, caution, right_if_found)
 
 
 def _answer(request: Request, things: list[Things], view: Sight) -> list[Thing] | None:
@@ -107,22 +118,39 @@ def _answer(request: Request, things: list[Things], view: Sight) -> list[Thing] 
 
 
 def _is_right(
-    request: Request, view: Sight, asked: Known, given: list[Thing] | None, truth: list[Thing] | None
+    request: Request, view: Sight, asked: Known, given: list[Thing] | None, things: list[Things]
 ) -> bool:
-    """Compare things: the same set, or for a single one, one that measures as much as the true one."""
+    """Compare things with the answer from the true `things`: the same list, or for a single one, one that
+    measures as much."""
+    truth = _answer(request, things, view)
     if given is None or truth is None:
         return given is truth
     if not all(thing in asked.matches for thing in given):
         return False
-    matched = {asked.matches[thing] for thing in given} - {None}
+    matched = [one for one in (asked.matches[thing] for thing in given) if one]
     words = table()
     kinds = [words["superlatives"].get(request.superlative), words["from"].get(request.along)]
     kind = next((kind for kind in kinds if kind), None)
     if kind is None or not truth:
-        return matched == set(truth)
-    wanted, size = measure(truth[0], kind[0], view), truth[0].size
-    scale = float(size.prod() if kind[0] == "volume" else size.max())
-    return any(one and abs(measure(one, kind[0], view) - wanted) <= TIE * scale for one in matched)
+        always, ever = _borders(request, things, view)
+        return always <= {one.id for one in matched} <= ever
+    wanted = measure(truth[0], kind[0], view)
+    tie = NEAR * truth[0].size.max() if kind[0] in ("left", "top") else TIE * wanted
+    return any(abs(measure(one, kind[0], view) - wanted) <= tie for one in matched)
+
+
+def _borders(request: Request, things: list[Things], view: Sight) -> tuple[set[int], set[int]]:
+    """Return the ids that a relation holds for wherever things are within `NEAR`, and for some such place."""
+    answers = [{thing.id for thing in _answer(request, things, view) or []}]
+    for step in (sign * NEAR * axis for axis in (view.right, view.up, view.ahead) for sign in (-1, 1)):
+        moved = [_moved(one, step if one.word == request.word else -step) for one in things]
+        answers.append({thing.id for thing in _answer(request, moved, view) or []})
+    return set.intersection(*answers), set.union(*answers)
+
+
+def _moved(one: Things, step: Float[Array, "3"]) -> Things:
+    moved = (replace(thing, center=thing.center + step * thing.size.max()) for thing in one.things)
+    return Things(one.word, list(moved))
 
 
 def in_words(outcomes: Sequence[Outcome]) -> str:

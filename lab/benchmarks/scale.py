@@ -241,8 +241,8 @@ def _landmark_features(path: Path) -> tuple[Tensor, Tensor]:
     from lab.baselines.lifting import LiftedFeatures
     from lab.landmark.demo_scene import DemoScene
     from lab.landmark.scene_writer import write_scene
+    from lab.run_config import run_config
     from lang3dxl_ns.common.files import write_atomically
-    from lang3dxl_ns.methods import run_config
     from lang3dxl_ns.plugin.trainer import Lang3DXLTrainer
 
     class Kept(LiftedFeatures):
@@ -320,7 +320,7 @@ def _run(out: Path, photos: int, gaussians: int, steps: int) -> list[Stage]:
 
 
 def _configuration(data: Path, out: Path, steps: int) -> Lang3DXLTrainerConfig:
-    from lang3dxl_ns.methods import run_config
+    from lab.run_config import run_config
 
     config = run_config(data, out / "runs", "scale", steps, "builtin", "builtin")
     config.pipeline.datamanager.cache_dir = out / "targets"

@@ -182,7 +182,7 @@ def scene_labels(scenes: Sequence[Path]) -> dict[str, Path]:
 
 def run_configuration(run: Run, settings: RunSettings, work: Path) -> Lang3DXLTrainerConfig:
     """Build the configuration of a run, which goes on where an earlier attempt in the folder was stopped."""
-    from lang3dxl_ns.methods import run_config
+    from lab.run_config import run_config
 
     names = settings.clip, settings.dense, run.row.method
     config = run_config(run.scene, work / "runs", run.label, run.steps, *names)
@@ -298,7 +298,7 @@ def _peak() -> float:
 @torch.no_grad()
 def _time_answers(pipeline: Lang3DXLPipeline) -> dict[str, float]:
     """Measure the median milliseconds to render a held-out view, and to answer all prompts in it."""
-    from lang3dxl_ns.plugin.cameras import to_rasterizer
+    from lang3dxl_ns.plugin.cameras import photo_camera
 
     scorer = pipeline.evaluation.scorer
     if scorer is None:
@@ -310,7 +310,7 @@ def _time_answers(pipeline: Lang3DXLPipeline) -> dict[str, float]:
         start = _now()
         pipeline.model.get_outputs_for_camera(camera)
         rendered = _now()
-        scene.relevancy_maps(to_rasterizer(camera), scorer.queries.to(pipeline.device))
+        scene.relevancy_maps(photo_camera(camera).camera(), scorer.queries.to(pipeline.device))
         times["render_ms"].append(1000 * (rendered - start))
         times["answer_ms"].append(1000 * (_now() - rendered))
     return {name: median(values) for name, values in times.items()}

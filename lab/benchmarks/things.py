@@ -19,7 +19,7 @@ from lab.reports import command_line
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.reports import markdown_table, write_report
 from lang3dxl_ns.query.scene import Scene
-from lang3dxl_ns.things.find import Things, things_of
+from lang3dxl_ns.things.find import Things
 from lang3dxl_ns.things.thing import Thing
 
 NEAR = 0.6
@@ -51,7 +51,7 @@ class ThingsBenchmark:
             scene, truth = load_scene(path), true_things_of(load_scene(path), data)
             scene.mass  # noqa: B018 — measured once per scene, at the first query
             start = time.process_time()
-            answers = things_of(scene, list(CATEGORIES))
+            answers = scene.things(list(CATEGORIES))
             seconds[data.parent.name] = time.process_time() - start
             rows += [score(answer, truth, data.parent.name) for answer in answers]
             asked += ask_all(scene, {one.word: known(one, truth) for one in answers})
@@ -123,8 +123,9 @@ def known(answer: Things, truth: Sequence[TrueThing]) -> Known:
     """Tell which things found are which true ones, for questions."""
     own = [thing for thing in truth if thing.word == answer.word]
     seen, hidden = ([t for t in own if t.seen is shown] for shown in (True, False))
-    true = [Thing(-1 - i, t.word, 1.0, 0, t.center, t.axes, t.size, np.zeros(0, int))
-            for i, t in enumerate(seen)]  # fmt: skip
+    # An id of its own each, over all words: a thing has no relation to itself.
+    true = [Thing(-1 - truth.index(t), t.word, 1.0, 0, t.center, t.axes, t.size, np.zeros(0, int))
+            for t in seen]  # fmt: skip
     matches: dict[Thing, Thing | None] = {answer.things[a]: true[b] for a, b in matched(answer.things, seen)}
     free = [thing for thing in answer.things if thing not in matches]
     return Known(answer, true, matches | {free[a]: None for a, _ in matched(free, hidden)})

@@ -57,8 +57,8 @@ def _train_and_evaluate(settings: TrainingBenchmark, threads: int = 0) -> dict[s
 
     import torch
 
+    from lab.run_config import run_config
     from lang3dxl_ns.common.reports import measure
-    from lang3dxl_ns.methods import run_config
     from lang3dxl_ns.plugin.trainer import Lang3DXLTrainer
 
     name = "joint" if settings.clip != "none" else "rgb"

@@ -13,7 +13,7 @@ from lang3dxl_ns.evaluation.scores import open_scorer
 from lang3dxl_ns.preparation.physical_scale import pixel_sizes
 from lang3dxl_ns.scene.capture import Capture, Split
 from lang3dxl_ns.scene.colmap import TrackedPhoto
-from lang3dxl_ns.scene.masks import find_mask
+from lang3dxl_ns.scene.masks import MaskFolder
 from lang3dxl_ns.scene.photo import Photo
 from lang3dxl_ns.training.batches import TrainingData
 from lang3dxl_ns.training.state import Training
@@ -43,7 +43,7 @@ def novel_data(data: TrainingData, views: NovelViews) -> TrainingData:
 
     def photo(view: TrackedPhoto) -> Photo:
         picture = views.image(view)
-        mask = find_mask(views.folder / "masks", picture.name) if masked else None
+        mask = MaskFolder(views.folder / "masks").find(picture.name) if masked else None
         return Photo.from_model(view, picture, mask)
 
     masked = data.config.foreground != "none"

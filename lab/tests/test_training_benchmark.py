@@ -7,7 +7,7 @@ from scenes import write_scene
 from tiny_models import make_tiny_clip, make_tiny_dinov2
 
 from lab.benchmarks import training
-from lang3dxl_ns.methods import run_config
+from lab.run_config import run_config
 
 
 def test_the_report_of_training_has_the_parts_of_a_step(tmp_path, monkeypatch):
@@ -16,7 +16,7 @@ def test_the_report_of_training_has_the_parts_of_a_step(tmp_path, monkeypatch):
         config.pipeline.model.decoder.compression.steps = 40  # 15 seconds otherwise
         return config
 
-    monkeypatch.setattr("lang3dxl_ns.methods.run_config", quick)
+    monkeypatch.setattr("lab.run_config.run_config", quick)
     monkeypatch.setattr(training, "ProcessPoolExecutor", lambda *_, **__: ThreadPoolExecutor(1))
     data = write_scene(tmp_path / "scene", photos=4, points=60)
     models = str(make_tiny_clip(tmp_path / "clip")), str(make_tiny_dinov2(tmp_path / "dinov2"))

@@ -31,8 +31,6 @@ from lang3dxl_ns.scene.capture import Capture, open_capture
 from lang3dxl_ns.scene.companions import cache_folder
 from lang3dxl_ns.scene.photo_folder import check_data
 
-_LIGHT = 0.15
-"""Deviation of the photos' brightness (natural logarithm) above which a message reports it."""
 _SMALLEST = 1e-3
 """Size of a splat in its units, below which it lies before the near plane of every camera that shows it."""
 _NEAREST = 1.2e-4
@@ -146,7 +144,4 @@ def _frame(splats: Splats, collection: Capture, path: Path, place: Path | None) 
             "splat was trained with, or leave out --data"
         )
     say(f"the splat's frame is {fit.name}: renderings agree with their photos to {fit.score:.2f} (of 1)")
-    if fit.lighting > _LIGHT:
-        light = f"the photos' brightness varies by {100 * fit.lighting:.0f} % beside the splat's"
-        say(f"{light}: words are learned all the same; the scene keeps the splat's colors")
     return fit.similarity

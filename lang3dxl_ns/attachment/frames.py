@@ -56,18 +56,13 @@ class Fit:
     similarity: Similarity
     score: float
     """Mean correlation of brightness, −1…1."""
-    gains: tuple[float, ...]
-    """Brightness of each compared photo, relative to its rendering."""
+    photos: int
+    """Number of photos that were compared."""
 
     @property
     def fits(self) -> bool:
         """Whether the frame is right."""
-        return self.score >= (FITS if len(self.gains) >= _FEW else FITS_FEW)
-
-    @property
-    def lighting(self) -> float:
-        """Standard deviation of the photos' brightness relative to the renderings, natural logarithms."""
-        return float(np.std(np.log(np.clip(self.gains, 1e-3, None)))) if self.gains else 0.0
+        return self.score >= (FITS if self.photos >= _FEW else FITS_FEW)
 
 
 def camera_in(similarity: Similarity | Float[Tensor, "4 4"], tracked: TrackedPhoto) -> Camera:
@@ -165,12 +160,8 @@ def _compared(collection: Capture, count: int, side: int) -> list[_Compared]:
 
 @torch.no_grad()
 def _fit(splats: Splats, photos: Sequence[_Compared], name: str, similarity: Similarity) -> Fit:
-    scores, gains = [], []
-    for photo in photos:
-        drawn, gray, mask = photo.beside(splats, similarity)
-        scores.append(float(_correlation(drawn, gray, mask)))
-        gains.append(float(gray[mask].mean() / drawn[mask].mean().clamp_min(1e-3)) if mask.any() else 1.0)
-    return Fit(name, similarity, float(np.mean(scores)), tuple(gains))
+    scores = [float(_correlation(*photo.beside(splats, similarity))) for photo in photos]
+    return Fit(name, similarity, float(np.mean(scores)), len(photos))
 
 
 def _refined(

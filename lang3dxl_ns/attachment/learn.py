@@ -89,10 +89,7 @@ def _views(
 
 
 def scene_file(
-    collection: Capture,
-    cameras: Mapping[str, Camera],
-    similarity: Similarity,
-    config: PreparationConfig,
+    collection: Capture, cameras: Mapping[str, Camera], similarity: Similarity, config: PreparationConfig
 ) -> SceneRecord:
     """Describe what a scene keeps of its photos and of the frame, where splat's = similarity · photos'."""
     known = find_model(config.clip, CLIP_OPTION)

@@ -41,7 +41,7 @@ def segmented(
             marked = photo.undistort_labels(masks[photo.name].int()) == 1
             camera, values = resized(cameras[photo.name], _SIDE), marked[..., None].to(like)
             foreground = photo.read_mask(camera.width / photo.width)
-            drawn = partial(composite, scene.splats, camera, backend=scene.backend)
+            drawn = partial(composite, scene.splats, camera)
             yield drawn, Pixels.of([values], (camera.height, camera.width), foreground)
 
     like = scene.splats.means
@@ -61,7 +61,7 @@ def _share(scene: Scene, photo: Photo, camera: Camera, chosen: Bool[Tensor, " n"
     """Compute the share of the scene's pixels in a photo's foreground that the chosen Gaussians fill."""
     small = resized(camera, MARK_SIDE)
     both = torch.stack([chosen, torch.ones_like(chosen)], dim=1).to(scene.splats.means)
-    drawn = composite(scene.splats, small, both, scene.backend)
+    drawn = composite(scene.splats, small, both)
     foreground = photo.read_mask(small.width / photo.width)
     keep = Pixels.of([drawn], (small.height, small.width), foreground).foreground
     filled = (drawn * keep[..., None]).flatten(0, -2).sum(0)

@@ -96,19 +96,17 @@ def solids(splats: Splats) -> Splats:
 def _found_up(solid: Splats, center: Float[Tensor, "3"], radius: float) -> Float[Tensor, "3"]:
     """Find the up direction, and say what was found, how certainly, and how to change it."""
     found = find_up(solid, center, radius)
-    name, other = (f"{name_of_axis(way)} ({_numbers(way)})" for way in (found.direction, found.second))
+    ways = found.direction, found.second
+    numbers = [f"{x:.2f},{y:.2f},{z:.2f}" for x, y, z in map(Tensor.tolist, ways)]
+    name, other = (f"{name_of_axis(way)} ({text})" for way, text in zip(ways, numbers, strict=True))
     if found.margin >= CERTAIN:
         say(f"up is about {name}, by a margin of {found.margin:.1f}; --up sets another direction")
     else:
         say(
             f"which way is up is doubtful: {name} leads {other} by only {found.margin:.1f}. If the views "
-            f"aren't upright, set --up={_numbers(found.second)}"
+            f"aren't upright, set --up={numbers[1]}"
         )
     return found.direction
-
-
-def _numbers(direction: Float[Tensor, "3"]) -> str:
-    return ",".join(f"{value:.2f}" for value in direction.tolist())
 
 
 def rendered_views(splats: Splats, count: int, up: str, folder: Path) -> Capture:

@@ -20,9 +20,7 @@ if TYPE_CHECKING:
     from lang3dxl_ns.query.text import Prompt
 
 
-@showing(
-    *("splat", "data", "out", "text", "clip", "up", "foreground", "segment"),
-)
+@showing("splat", "data", "out", "text", "clip", "up", "foreground", "segment")
 @dataclass(kw_only=True)
 class Attach(AttachConfig):
     """Give words to a finished splat: write a scene that answers any text, without training colors again.

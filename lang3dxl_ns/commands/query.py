@@ -177,21 +177,13 @@ class CocoLabels:
                 if area < _LEAST_PART * mask.size:
                     continue
                 rows, columns = place
+                whole = np.zeros(mask.shape, bool)
+                whole[place] = part
                 box = [columns.start, rows.start, columns.stop - columns.start, rows.stop - rows.start]
-                outline = {"size": [height, width], "counts": _runs(part, place, mask.shape)}
+                outline = {"size": [height, width], "counts": run_lengths(whole)}
                 labeled = {"id": len(annotations) + 1, "image_id": len(images), "category_id": category}
                 found = {"segmentation": outline, "area": area, "bbox": box, "iscrowd": 0}
                 annotations.append({**labeled, **found})
-
-
-def _runs(part: Bool[Array, "r c"], place: tuple[slice, slice], size: tuple[int, ...]) -> list[int]:
-    """Return the `run_lengths` of a mask of this size with one part at a place, from its columns alone."""
-    (rows, columns), (height, width) = place, size
-    runs = run_lengths(np.pad(part, ((rows.start, height - rows.stop), (0, 0))))
-    runs[0] += height * columns.start
-    runs += [0] * (len(runs) % 2 == 0)
-    runs[-1] += height * (width - columns.stop)
-    return runs if runs[-1] else runs[:-1]
 
 
 def parse_texts(
@@ -225,10 +217,7 @@ def _text_report(
     return told | {"threshold": threshold, "folder": folder.name}
 
 
-@showing(
-    *("scene", "text", "not_", "out", "web", "scene_file", "title", "all"),
-    *("look", "settings"),
-)
+@showing(*("scene", "text", "not_", "out", "web", "scene_file", "title", "all"), *("look", "settings"))
 @dataclass(kw_only=True)
 class Export:
     """Write a scene in another form. --out writes a splat file of the Gaussians that match a text, in the
@@ -250,7 +239,7 @@ class Export:
     photos: Path | None = None
     """Folder of the scene's photos, of which the page shows small copies (default: none are published)."""
     scene_file: Path | None = None
-    """Scene file to write, NAME.scene, or NAME.glb, which viewers of glTF show too."""
+    """Scene file to write, NAME.scene, or NAME.glb or NAME.spz, which splat viewers show too."""
     title: str = ""
     """Title of page and scene (default: the scene's own, or the name of the photos' folder)."""
     credit: str = ""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -35,21 +36,17 @@ class ListThings:
     out: Path | None = None
     """Folder for the files."""
     splats: bool = False
-    """Write a splat file for each thing too."""
+    """Write a splat file for each thing too, and scene.glb with things as features (EXT_mesh_features)."""
     clip: str | None = None
     """Name or folder of the scene's CLIP, if it is not where the scene file says."""
 
     def main(self) -> None:
         from lang3dxl_ns.open_scene import load_scene
-        from lang3dxl_ns.things.find import things_of
-        from lang3dxl_ns.things.grammar import answer, parse, unsure
-        from lang3dxl_ns.things.sight import sight_of
+        from lang3dxl_ns.things.grammar import answer, parse, sight_of, unsure
         from lang3dxl_ns.things.write import write_catalog, write_picture, write_things
 
         requests = [(text, parse(text)) for text in self.ask]
-        words = list(
-            dict.fromkeys([*self.text, *(word for _, request in requests for word in request.words)])
-        )
+        words = list(dict.fromkeys([*self.text, *(word for _, asked in requests for word in asked.words)]))
         if not words:
             raise UserError("give --text or --ask: say which things to look for, such as --text windows")
         if self.splats and self.out is None:
@@ -57,7 +54,7 @@ class ListThings:
         scene = load_scene(self.scene, clip=self.clip)
         if self.view is not None:
             scene.file.photo(self.view)
-        answers = things_of(scene, words)
+        answers = scene.things(words)
         by_word = dict(zip(words, answers, strict=True)) if len(answers) == len(words) else {}
         for one in answers:
             say(f"{one.word}: {one.count}" + (f" ({one.caution})" if one.caution else ""))
@@ -65,11 +62,12 @@ class ListThings:
             if not by_word:
                 raise UserError("--text holds several prompts: repeat the flag instead")
             named = [by_word[word] for word in request.words]
-            chosen = answer(request, named, lambda things: sight_of(scene, things, self.view))
+            sight = partial(sight_of, scene, photo=self.view)
+            chosen = answer(request, named, sight)
             whole = request.count and not (request.relation or request.without)
             told = by_word[request.word].count if whole else str(len(chosen))
             listed = ", ".join(_described(thing) for thing in chosen)
-            doubt = None if whole else unsure(request, named)
+            doubt = None if whole else unsure(request, named, sight)  # the range of a count tells it
             note = f" (unsure, since {doubt})" if doubt else ""
             say(f"{text}: {told if request.count else listed or 'none found'}{note}")
         if self.out is not None:

@@ -50,6 +50,8 @@ class Train(SceneSettings, PreparationConfig):
     """Folder of prepared targets (default: lang3dxl_cache inside the data folder)."""
     seed: int = 42
     """Seed of all that is random."""
+    mixed_precision: bool = False
+    """Compute networks in bfloat16, on a GPU that multiplies it."""
     restart: bool = False
     """Train anew, over the run in the folder."""
 
@@ -71,7 +73,8 @@ class Train(SceneSettings, PreparationConfig):
         for owner, kind in ((settings.scene, SceneSettings), (settings.targets, PreparationConfig)):
             for name, value in _changed(self, kind).items():
                 setattr(owner, name, value)
-        settings.save_every, settings.seed = self.save_every, self.seed
+        for name in ("save_every", "seed", "mixed_precision"):
+            setattr(settings, name, getattr(self, name))
         settings.photo_scale = self.photo_scale or settings.photo_scale
         if self.looks != "auto":
             settings.scene.appearance.use = self.looks

@@ -7,12 +7,13 @@ import unicodedata
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
+from zipfile import BadZipFile
 
 from lang3dxl_ns.common.memory import ran_out_of_memory
 
 DAMAGE = (
     *(OSError, EOFError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RuntimeError),
-    *(AssertionError, struct.error, zlib.error),
+    *(AssertionError, struct.error, zlib.error, BadZipFile),
 )
 """Exceptions raised when values are read that a damaged file does not have. A RuntimeError may also mean a
 full memory, which `not_of_memory` tells apart."""

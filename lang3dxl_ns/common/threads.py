@@ -27,7 +27,8 @@ def sleep_soon() -> None:
     elif _is_training_command(sys.argv, sys.orig_argv):
         sys.stdout.flush()
         sys.stderr.flush()
-        os.execve(sys.executable, [sys.executable, *sys.orig_argv[1:]], os.environ | {_SPINS: _SHORT})
+        variables = {"PYTHONWARNINGS": "ignore::FutureWarning"} | os.environ | {_SPINS: _SHORT}  # said once
+        os.execve(sys.executable, [sys.executable, *sys.orig_argv[1:]], variables)
 
 
 def _is_training_command(words: list[str], started_with: list[str]) -> bool:

@@ -21,7 +21,7 @@ from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.settings_help import showing
 from lang3dxl_ns.components.hash_grid import HashGrid
 from lang3dxl_ns.components.linear import linear
-from lang3dxl_ns.rendering import Backend, Gaussians, Rendering, Splats, harmonics_of, render
+from lang3dxl_ns.rendering import Gaussians, Rendering, Splats, harmonics_of, render
 from lang3dxl_ns.scene.camera import Camera, in_view
 
 HIDDEN = 64
@@ -258,12 +258,11 @@ def render_in_look(
     channels: Float[Tensor, "n d"] | None = None,
     *,
     background: Float[Tensor, "3"] | None = None,
-    backend: Backend = "auto",
 ) -> Rendering:
     """Render Gaussians (world frame) under a photo's lighting, or in their own colors without a look; for the
     other arguments see `render`. Coverage, depth and further channels belong to the scene, not to a photo. If
     a look changes opacities, they are rendered separately, with the opacities of the scene."""
-    draw = partial(render, camera=camera, background=background, backend=backend)
+    draw = partial(render, camera=camera, background=background)
     lit = splats if look is None else look.apply(splats, camera, everywhere=False)
     if lit.opacities is splats.opacities:
         return draw(lit, channels=channels)

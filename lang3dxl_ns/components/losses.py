@@ -49,10 +49,7 @@ def clip_loss(
 
 
 @in_full_precision
-def dense_loss(
-    prediction: Float[Tensor, "h w d"],
-    target: Float[Tensor, "hd wd d"],
-) -> Float[Tensor, ""]:
+def dense_loss(prediction: Float[Tensor, "h w d"], target: Float[Tensor, "hd wd d"]) -> Float[Tensor, ""]:
     """Compute the mean absolute difference between decoded dense features, resized to their target's grid,
     and the target. As in the published system, it has no mask. The resize is bilinear and antialiased: it
     averages when shrinking, and keeps positions within a tenth of a cell."""

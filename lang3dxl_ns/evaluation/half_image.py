@@ -18,7 +18,7 @@ from torch import Tensor
 from lang3dxl_ns.common.reports import synchronize
 from lang3dxl_ns.components.appearance import AppearanceField, Look, render_in_look
 from lang3dxl_ns.components.losses import rgb_loss
-from lang3dxl_ns.rendering import Backend, Splats, rasterize
+from lang3dxl_ns.rendering import Splats, rasterize
 from lang3dxl_ns.scene.camera import Camera, in_view
 
 STEPS = 64
@@ -43,7 +43,6 @@ class HalfImageProtocol:
     """Color behind the scene, 0…1."""
     ssim_weight: float
     """Weight of 1 − SSIM in the color loss, as in training."""
-    backend: Backend = "auto"
 
     @torch.no_grad()
     def measure(
@@ -58,8 +57,8 @@ class HalfImageProtocol:
         vector = self.fit(camera, photo[:, :middle], None if mask is None else mask[:, :middle])
         synchronize()
         seconds = perf_counter() - start
-        settings: dict[str, Any] = {"background": self.background, "backend": self.backend}
-        rendering = render_in_look(self.splats, camera, Look(self.field, vector), **settings).rgb
+        look = Look(self.field, vector)
+        rendering = render_in_look(self.splats, camera, look, background=self.background).rgb
         right = None if mask is None else mask[:, middle:]
         scores = self.metrics(rendering[:, middle:], photo[:, middle:], right)
         return rendering, {f"half_{name}": value for name, value in scores.items()} | {"fit_seconds": seconds}
@@ -79,7 +78,7 @@ class HalfImageProtocol:
         splats = self.splats.select(in_view(view, self.splats.means, self.splats.scales))
         gaussians, colors = splats.gaussians, splats.colors(view.position)
         everything = torch.arange(len(splats), device=colors.device)
-        settings: dict[str, Any] = {"antialiased": splats.antialiased, "backend": self.backend}
+        settings: dict[str, Any] = {"antialiased": splats.antialiased, "backend": splats.backend}
         optimizer = torch.optim.Adam([vector], lr=RATE)
         schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, max(steps, 1))
         with torch.enable_grad():

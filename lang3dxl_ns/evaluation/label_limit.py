@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 from numpy import ndarray as Array
 from torch import Tensor
 
-from lang3dxl_ns.rendering import Backend, Splats, composite
+from lang3dxl_ns.rendering import Splats, composite
 from lang3dxl_ns.rendering.gathering import Pixels, gather
 from lang3dxl_ns.scene.camera import Camera
 
@@ -20,15 +20,15 @@ Masks = Mapping[str, Bool[Array, "h w"]]
 
 
 def label_limit(
-    splats: Splats, views: Iterable[tuple[Camera, Masks]], categories: list[str], backend: Backend = "auto"
+    splats: Splats, views: Iterable[tuple[Camera, Masks]], categories: list[str]
 ) -> Callable[[Camera], Float[Tensor, "categories h w"]]:
     """Return a function from a view to its maps, in the order of the categories."""
-    shares = lifted_labels(splats, views, categories, backend)
-    return lambda camera: composite(splats, camera, shares, backend).permute(2, 0, 1)
+    shares = lifted_labels(splats, views, categories)
+    return lambda camera: composite(splats, camera, shares).permute(2, 0, 1)
 
 
 def lifted_labels(
-    splats: Splats, views: Iterable[tuple[Camera, Masks]], categories: list[str], backend: Backend = "auto"
+    splats: Splats, views: Iterable[tuple[Camera, Masks]], categories: list[str]
 ) -> Float[Tensor, "n categories"]:
     """Compute each Gaussian's mean label over the pixels that it contributes to, weighted by compositing
     weight, in all `views` that label the category. It is 0 for Gaussians that none of these views shows."""
@@ -37,7 +37,7 @@ def lifted_labels(
         for camera, masks in views:
             size = camera.height, camera.width
             labels = Pixels.of([_labels(masks, categories, size)], size)
-            yield partial(composite, splats, camera, backend=backend), labels
+            yield partial(composite, splats, camera), labels
 
     lifted, _ = gather(len(splats), probes(), 2 * len(categories), splats.means)
     labels, labeled = lifted.chunk(2, dim=1)

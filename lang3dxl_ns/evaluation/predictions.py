@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from numpy import ndarray as Array
 from torch import Tensor
 
@@ -56,7 +56,7 @@ def score_predictions(
         size = truth.scoring_size(*truth.size(key))
         truths = truth.truths(key, size)
         found: Maps = {c: _read_map(maps, (c, folders[c]), key, size) for c in truths}
-        keep = _read_mask(files[key]) if files else None
+        keep = torch.from_numpy(np.asarray(read_gray(files[key], "mask")) >= 128) if files else None
         figures[key] = scorer.scores(key, scorer.variants(found, keep, temperature), truths)
     statement = f"predictions are 0 outside the masks of {len(files)} of {len(keys)} photos, {masks}"
     protocol = {"maps": str(maps), "evaluated_photos": len(keys)} | scorer.protocol(
@@ -110,7 +110,3 @@ def _mask_file(folder: Path, photo: str) -> Path:
     if path is None:
         raise UserError(f"{folder} holds no mask of the photo {photo}: add it, white = keep")
     return path
-
-
-def _read_mask(path: Path) -> Bool[Tensor, "h w"]:
-    return torch.from_numpy(np.asarray(read_gray(path, "mask")) >= 128)

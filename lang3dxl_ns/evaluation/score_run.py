@@ -193,7 +193,7 @@ class _Photos:
             for camera, photo in photos
         )
         masks = ((camera, {name: t.mask for name, t in truths.items()}) for camera, truths in labels)
-        self.limit = label_limit(scene.splats, masks, truth.categories, scene.backend)
+        self.limit = label_limit(scene.splats, masks, truth.categories)
 
     def camera(self, view: PhotoCamera) -> Camera:
         """Return a photo's camera, refined if it was trained on."""
@@ -247,9 +247,7 @@ class _Photos:
         """Score colors by the half-image protocol; see `HalfImageProtocol.measure`."""
         scene, weight = self.scene, self.run.settings.ssim_lambda
         assert scene.looks is not None and scene.background is not None
-        protocol = HalfImageProtocol(
-            scene.splats, scene.looks, self.metrics, scene.background, weight, scene.backend
-        )
+        protocol = HalfImageProtocol(scene.splats, scene.looks, self.metrics, scene.background, weight)
         return protocol.measure(self.camera(view), colors_of(batch, scene.device), foreground(batch))
 
 
@@ -283,14 +281,14 @@ def _feature_maps(
     compositing, depending on the decoder."""
     decoder, codes = scene.semantics()
     if not decoder.per_gaussian:
-        maps = composite(scene.splats, camera, codes, scene.backend)
+        maps = composite(scene.splats, camera, codes)
         maps = resize_nearest(maps, fitted_size(maps.shape, longer_side))
         clip, dense = decoder(maps)
         return clip, dense, None if mask is None else resize_nearest(mask, (maps.shape[0], maps.shape[1]))
     # The last layer is linear, so hidden activations are composited and divided by coverage.
     known = codes.isfinite().all(1, keepdim=True)
     hidden = torch.where(known, decoder.hidden(torch.where(known, codes, 0.0)), 0.0)
-    maps = composite(scene.splats, camera, torch.cat([hidden, known.to(hidden)], dim=1), scene.backend)
+    maps = composite(scene.splats, camera, torch.cat([hidden, known.to(hidden)], dim=1))
     size = fitted_size(maps.shape, longer_side)
     maps = resize_nearest(maps, size)
     clip, head = maps[..., :-1] / maps[..., -1:].clamp_min(1e-3), decoder.clip_head()

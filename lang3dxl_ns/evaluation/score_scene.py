@@ -106,7 +106,7 @@ def score_selections(scene: Scene, truth: GroundTruth, photos: Sequence[ScenePho
         for category, match in zip(truth.categories, matches, strict=True):
             if category in truths and truths[category].mask.any():
                 ious[category].append(overlap(match.mask, truths[category].mask)["iou"])
-    shares = lifted_labels(scene.splats, labels, truth.categories, scene.backend)
+    shares = lifted_labels(scene.splats, labels, truth.categories)
     figures: dict[str, float] = {}
     for category, found, share in zip(truth.categories, scene.places(question), shares.T, strict=True):
         mass = scene.mass

@@ -1,4 +1,4 @@
-"""GLB, glTF's binary form, with splats (KHR_gaussian_splatting) and, if asked for, the whole scene.
+"""GLB, glTF's binary form, with splats (KHR_gaussian_splatting) and, if asked for, things or the scene.
 
 A scene's record is a scene file in a buffer view of its own, which other readers skip.
 """
@@ -6,70 +6,128 @@ A scene's record is a scene file in a buffer view of its own, which other reader
 from __future__ import annotations
 
 import json
+import re
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from math import isqrt
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch.nn.functional as F
-from jaxtyping import Float32, Shaped
+from jaxtyping import Float, Float32, Shaped
 from numpy import ndarray as Array
+from torch import Tensor
 
 from lang3dxl_ns.common.checks import expect
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.files.activations import ALL_BANDS, array_of, check_memory, tensor_of
 from lang3dxl_ns.rendering import Splats
+from lang3dxl_ns.scene.georeference import Georeference
+from lang3dxl_ns.things.thing import Thing
 
-SUFFIX = ".glb"
 _SPLATS, _RECORD = "KHR_gaussian_splatting", "LANG3DXL_scene"
+_FEATURES, _METADATA = "EXT_mesh_features", "EXT_structural_metadata"
 _HEADER, _CHUNK = struct.Struct("<4sII"), struct.Struct("<I4s")
 _FLOAT, _POINTS, _ARRAY_BUFFER = 5126, 0, 34962
 _KINDS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", _FLOAT: "<f4"}
-_SIDES = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
+_SIDES = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 _MOST_DEGREE = 3
 
 
-def encode_glb(splats: Splats, record: bytes | None = None) -> bytes:
-    """Encode splats, in their own frame and units. record: content of the scene's file."""
-    content, views, accessors, named = bytearray(), list[dict[str, Any]](), list[dict[str, Any]](), {}
-    for name, values in _attributes(splats):
-        named[name] = len(accessors)
-        kind = next(
-            kind for kind, side in _SIDES.items() if side == (values.shape[1] if values.ndim > 1 else 1)
-        )
-        accessor = {"bufferView": len(views), "componentType": _FLOAT, "count": len(values), "type": kind}
-        if name == "POSITION":
-            accessor |= {"min": values.min(0).tolist(), "max": values.max(0).tolist()}
-        views.append({"byteOffset": len(content), "byteLength": values.nbytes, "target": _ARRAY_BUFFER})
-        accessors.append(accessor)
-        content += values.astype("<f4").tobytes()
-    about = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
-    primitive = {"mode": _POINTS, "attributes": named, "extensions": {_SPLATS: about}}
+def encode_glb(
+    splats: Splats,
+    record: bytes | None = None,
+    codes: Float[Tensor, "n d"] | None = None,
+    things: Sequence[Thing] = (),
+    place: Georeference | None = None,
+) -> bytes:
+    """Encode the splats whose values are finite, in their own frame and units, with a scene file's content.
+
+    codes: finite semantic numbers, 1 to 4 a Gaussian, for the attribute `_CODE`. things: each word becomes a
+    set of feature ids, which are rows of one table of words, boxes and scores. place: meters, up and north,
+    by which the node is placed as glTF wants it: y up, z to the south."""
+    file, sound = _Writer(), splats.sound()
+    named = {name: file.attribute(values) for name, values in _attributes(splats.select(sound))}
+    if codes is not None and codes.shape[1] in _SIDES.values():
+        named["_CODE"] = file.attribute(array_of(codes[sound]))
+    local: dict[str, Any] = {_SPLATS: {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}}
+    shared = dict[str, Any]()
+    if things:
+        sets = list[dict[str, Any]]()
+        for word in dict.fromkeys(thing.word for thing in things):
+            ids, number = np.full(len(splats), len(things), np.float32), len(sets)
+            for i in np.argsort([-thing.size.prod() for thing in things]):  # small ones over large ones
+                ids[things[i].rows if things[i].word == word else []] = i
+            named[f"_FEATURE_ID_{number}"] = file.attribute(ids[sound.cpu().numpy()])
+            told = {"featureCount": len(set(ids) - {len(things)}), "nullFeatureId": len(things)}
+            label = re.sub(r"\W", "_", f"_{word}", flags=re.ASCII)
+            sets.append({**told, "attribute": number, "propertyTable": 0, "label": label})
+        local[_FEATURES], shared[_METADATA] = {"featureIds": sets}, _table(file, things)
+    if record is not None:
+        shared[_RECORD] = {"bufferView": file.view(record)}
+    node: dict[str, Any] = {"mesh": 0}
+    if place is not None:
+        axes = np.array([np.cross(place.north, place.up), place.up, np.negative(place.north)])
+        node["matrix"] = [*np.pad(place.meters * axes.T, (0, 1)).ravel().tolist()[:-1], 1.0]
+    extras = {"antialiased": splats.antialiased}
+    primitive = {"mode": _POINTS, "attributes": named, "extensions": local, "extras": extras}
+    file.content += bytes(-len(file.content) % 4)
     described: dict[str, Any] = {
         "asset": {"version": "2.0", "generator": "lang3dxl-ns"},
-        "extensionsUsed": [_SPLATS],
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0}],
-        "meshes": [{"primitives": [primitive | {"extras": {"antialiased": splats.antialiased}}]}],
+        "extensionsUsed": [*local, *shared],
+        **({"extensions": shared} if shared else {}),
+        **{"scene": 0, "scenes": [{"nodes": [0]}], "nodes": [node], "meshes": [{"primitives": [primitive]}]},
+        **{"accessors": file.accessors, "bufferViews": file.views},
+        "buffers": [{"byteLength": len(file.content)}],
     }
-    if record is not None:
-        described["extensionsUsed"].append(_RECORD)
-        described["extensions"] = {_RECORD: {"bufferView": len(views)}}
-        views.append({"byteOffset": len(content), "byteLength": len(record)})
-        content += record
-    content += bytes(-len(content) % 4)
-    described |= {"accessors": accessors, "bufferViews": [{"buffer": 0, **view} for view in views]}
-    described["buffers"] = [{"byteLength": len(content)}]
     text = json.dumps(described, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)
-    size = _HEADER.size + 2 * _CHUNK.size + len(text) + len(content)
+    size = _HEADER.size + 2 * _CHUNK.size + len(text) + len(file.content)
     if size >= 2**32:
         raise UserError(f"a .glb holds 4 GB, and these {len(splats):,} Gaussians need more: write a .ply")
-    chunks = (_CHUNK.pack(len(text), b"JSON"), text, _CHUNK.pack(len(content), b"BIN\0"), bytes(content))
+    chunks = _CHUNK.pack(len(text), b"JSON"), text, _CHUNK.pack(len(file.content), b"BIN\0"), file.content
     return _HEADER.pack(b"glTF", 2, size) + b"".join(chunks)
+
+
+class _Writer:
+    """Binary part of a file in the making, its views, and accessors of them."""
+
+    def __init__(self) -> None:
+        self.content = bytearray()
+        self.views, self.accessors = list[dict[str, Any]](), list[dict[str, Any]]()
+
+    def view(self, content: bytes, **more: int) -> int:
+        """Append bytes and return the number of their view."""
+        self.content += bytes(-len(self.content) % 8)  # the alignment of metadata
+        place = {"buffer": 0, "byteOffset": len(self.content), "byteLength": len(content)}
+        self.views.append(place | more)
+        self.content += content
+        return len(self.views) - 1
+
+    def attribute(self, values: Float32[Array, "n ..."]) -> int:
+        """Append a number or a vector of each Gaussian, and return the number of the accessor."""
+        rows = values.astype("<f4").reshape(len(values), -1)
+        kind = next(kind for kind, side in _SIDES.items() if side == rows.shape[1])
+        accessor = {"bufferView": self.view(rows.tobytes(), target=_ARRAY_BUFFER), "componentType": _FLOAT}
+        ends = {"min": rows.min(0).tolist(), "max": rows.max(0).tolist()}
+        self.accessors.append(accessor | ends | {"count": len(rows), "type": kind})
+        return len(self.accessors) - 1
+
+
+def _table(file: _Writer, things: Sequence[Thing]) -> dict[str, Any]:
+    """Append what is known of things, and describe it as the one table of EXT_structural_metadata."""
+    words = [thing.word.encode() for thing in things]
+    offsets = file.view(np.cumsum([0, *map(len, words)]).astype("<u4").tobytes())
+    kinds: dict[str, Any] = {"word": {"type": "STRING"}}
+    columns: dict[str, Any] = {"word": {"values": file.view(b"".join(words)), "stringOffsets": offsets}}
+    for name, kind in {"id": "SCALAR", "score": "SCALAR", "center": "VEC3", "size": "VEC3"}.items():
+        values = np.array([getattr(thing, name) for thing in things], "<u4" if name == "id" else "<f4")
+        kinds[name] = {"type": kind, "componentType": "UINT32" if name == "id" else "FLOAT32"}
+        columns[name] = {"values": file.view(values.tobytes())}
+    schema = {"id": "lang3dxl", "classes": {"thing": {"properties": kinds}}}
+    table = {"class": "thing", "count": len(things), "properties": columns}
+    return {"schema": schema, "propertyTables": [table]}
 
 
 def _attributes(splats: Splats) -> Iterator[tuple[str, Float32[Array, "n ..."]]]:
@@ -156,11 +214,8 @@ def read_glb(path: Path) -> Splats:
     return Splats(means, tensor_of(quats), scales, tensor_of(opacities), tensor_of(harmonics), antialiased)
 
 
-def scene_record(path: Path) -> bytes:
-    """Return the content of the scene file in a file. Raises UserError if there is none, and one of `DAMAGE`
-    for a damaged file."""
+def scene_record(path: Path) -> bytes | None:
+    """Read the scene file in a file; None if there is none. Raises one of `DAMAGE` for a damaged file."""
     file = _Glb(path)
     record = file.about.get("extensions", {}).get(_RECORD)
-    if record is None:
-        raise UserError("it holds splats without words; lang3dxl attach makes a scene of them")
-    return bytes(file.view(record["bufferView"]))
+    return None if record is None else bytes(file.view(record["bufferView"]))

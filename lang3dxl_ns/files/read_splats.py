@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from jaxtyping import Float32
 from numpy import ndarray as Array
+from PIL import Image
 
 from lang3dxl_ns.common.checks import expect
 from lang3dxl_ns.common.console import say
@@ -52,19 +53,9 @@ def find_splats(path: str | Path) -> Path:
 
 
 def read_splats(path: str | Path) -> Splats:
-    """Read all Gaussians of a file, in the file's order.
-
-    Gaussians with NaN or infinite values keep their place, but lose their size and opacity.
-
-    Args:
-        path: .ply (as 3D Gaussian splatting writes it, or compressed by SuperSplat), .spz, .sog,
-            .glb, .splat, a gsplat checkpoint (.pt), a splatfacto checkpoint (.ckpt), or the folder of a run
-            with one of them.
-
-    Raises:
-        UserError: there is no such file, or it is damaged, cut short, too large for this machine, of another
-            kind, or most of its values are not finite.
-    """
+    """Read all Gaussians of a file (one of `KINDS`), in the file's order. Those with NaN or infinite values
+    keep their place, but lose their size and opacity. Raises UserError if the file is missing, damaged, too
+    large for this machine or of another kind, or most of its values are not finite."""
     path = find_splats(path)
     reader = _READERS.get(path.suffix.lower())
     if reader is None:
@@ -80,7 +71,7 @@ def read_splats(path: str | Path) -> Splats:
         raise UserError(f"{path.suffix} files need gsply: pip install -e '.[share]'") from error
     except UserError as error:
         raise UserError(f"{path}: {error}") from error
-    except DAMAGE as error:
+    except (Image.DecompressionBombError, *DAMAGE) as error:
         not_of_memory(error)
         reason = in_a_line(error)
         raise UserError(f"{path} is damaged or incomplete ({reason}): copy or export it again") from error
@@ -107,10 +98,8 @@ def _finite(splats: Splats, path: Path) -> Splats:
         return splats
     if not sound.any():
         raise UserError(f"{path}: all its Gaussians are without rotation or size; export it again")
-    share, why = 1 - float(sound.float().mean()), "have NaN or infinite values"
-    if not (finite == sound).all():
-        why = "have no rotation, no size, or values that are no numbers"
-    say(f"{path}: {share:.2%} of its Gaussians {why}; they are left invisible")
+    why = "NaN or infinite values" if (finite == sound).all() else "no rotation, no size, or no numbers"
+    say(f"{path}: {1 - float(sound.float().mean()):.2%} of its Gaussians have {why}; they are left invisible")
     place, keep = splats.means[sound].median(0).values, sound[:, None]
     return replace(
         splats,

@@ -35,7 +35,7 @@ from lang3dxl_ns.components.appearance import AppearanceConfig, AppearanceField
 from lang3dxl_ns.components.decoders import DecoderConfig, make_decoder
 from lang3dxl_ns.components.feature_decoder import Decoder
 from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
-from lang3dxl_ns.files import glb
+from lang3dxl_ns.files import glb, spz
 from lang3dxl_ns.files.activations import log_scales, logits
 from lang3dxl_ns.query.question import QueryConfig
 from lang3dxl_ns.query.scene import Scene
@@ -48,6 +48,8 @@ from lang3dxl_ns.words.taught_words import TaughtWord, known_word, save_words, w
 
 Module = TypeVar("Module", bound=torch.nn.Module)
 SUFFIX = ".scene"
+_CARRIERS = {".glb": glb.scene_record, ".spz": spz.scene_record}
+"""Readers of the scene file that a splat file can carry."""
 VERSION = 1
 _KEY = "lang3dxl"
 _MASK_SIDE = 800
@@ -79,14 +81,14 @@ class Provenance:
 
 
 def check_scene_name(path: Path) -> None:
-    """Raise UserError if the name ends neither in .scene nor in .glb."""
-    if path.suffix not in (SUFFIX, glb.SUFFIX):
-        raise UserError(f"{path.name} doesn't name a scene: end it in {SUFFIX}, or in {glb.SUFFIX}")
+    """Raise UserError if the name ends in none of .scene, .glb and .spz."""
+    if path.suffix != SUFFIX and path.suffix not in _CARRIERS:
+        raise UserError(f"{path.name} doesn't name a scene: end it in {SUFFIX}, {' or '.join(_CARRIERS)}")
 
 
 def write_scene(path: Path, scene: Scene, provenance: Provenance | None = None) -> int:
     """Write a scene as one file, atomically, with foreground masks read from their files. Return the number
-    of bytes. A .glb is the scene's splats with its file inside, which viewers of glTF show.
+    of bytes. A .glb or .spz is the scene's splats, which viewers show, with its file inside.
     Raises UserError as `check_scene_name`."""
     check_scene_name(path)
     from safetensors.numpy import save
@@ -134,11 +136,22 @@ def write_scene(path: Path, scene: Scene, provenance: Provenance | None = None) 
     photos = [replace(photo, mask=None) for photo in scene.photos]
     described["scene"] = asdict(replace(scene.file, photos=photos, data=Path(scene.file.data).name))
     data = save(content, {_KEY: json.dumps(described, separators=(",", ":"))})
-    if path.suffix == glb.SUFFIX:
-        baked = scene.baked()
-        data = glb.encode_glb(baked.select(baked.sound()), data)
+    if path.suffix in _CARRIERS:
+        data = _carried(path.suffix, scene, data)
     write_atomically(path, data)
     return len(data)
+
+
+def _carried(kind: str, scene: Scene, record: bytes) -> bytes:
+    """Encode a scene's splats with its file inside."""
+    splats = scene.baked()
+    if kind == ".spz":
+        return spz.encode_spz(splats.select(splats.sound()), record)
+    codes = scene.codes
+    if codes is not None:
+        bounded = scene.decoder is not None and scene.decoder.bounded
+        codes = (codes.sigmoid() if bounded else codes).nan_to_num()
+    return glb.encode_glb(splats, record, codes, place=scene.file.georeference)
 
 
 def keep_words(path: Path, words: Mapping[str, TaughtWord | None]) -> None:
@@ -146,7 +159,7 @@ def keep_words(path: Path, words: Mapping[str, TaughtWord | None]) -> None:
     another command taught meanwhile stay. Raises UserError as `read_scene`."""
     from safetensors.numpy import save
 
-    if path.suffix == glb.SUFFIX:
+    if path.suffix in _CARRIERS:
         raise UserError(
             f"{path} keeps no words: write a scene, lang3dxl export {path} --scene-file NAME{SUFFIX}"
         )
@@ -188,10 +201,9 @@ def _with_words_of(scene: Scene, earlier: Path, replaced: Path) -> Scene:
         name, new = known_word(word.name), scene.words.get(known_word(word.name))
         if new is not None:
             if earlier == replaced and new.lacks_examples_of(word):
-                names = (
-                    f"{earlier.stem}.{slugs([name])[0]}{number}.json" for number in ("", *range(2, 1000))
-                )
-                backup = next(path for each in names if not (path := earlier.with_name(each)).exists())
+                backup = earlier.with_name(f"{earlier.stem}.{slugs([name])[0]}.json")
+                if backup.exists():
+                    set_aside(backup)
                 save_words(backup, [word])
                 say(f"The taught word {word.name!r} is replaced; with its examples it is kept in {backup}")
             continue
@@ -344,9 +356,11 @@ def _opened(path: Path) -> Iterator[_File]:
     try:
         with ExitStack() as stack:
             place = path
-            if path.suffix == glb.SUFFIX:
+            if path.suffix in _CARRIERS:
+                if (record := _CARRIERS[path.suffix](path)) is None:
+                    raise UserError("it holds splats without words")
                 place = Path(stack.enter_context(TemporaryDirectory())) / "record"
-                place.write_bytes(glb.scene_record(path))
+                place.write_bytes(record)
             yield _File(stack.enter_context(safe_open(place, "np")))
     except _NewerError as error:
         raise UserError(f"{path} has format {error}: a newer lang3dxl-ns wrote it; update yours") from error
@@ -391,7 +405,6 @@ def _decoder(file: _File, described: dict[str, Any]) -> Decoder:
     stored = sum(prod(shape) for name, shape in file.shapes.items() if name.startswith("decoder."))
     needed = _parameters(settings, clip + dense)
     expect(needed <= 4 * stored + 10_000_000, "its decoder is larger than the file")
-    settings.pop("coarse_to_fine", None)  # earlier versions wrote it
     config, choice = SemanticFieldConfig(preset="short", **settings), DecoderConfig(name=described["name"])
     return file.loaded("decoder", make_decoder(choice, config, clip, dense))
 

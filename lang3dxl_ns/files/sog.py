@@ -96,14 +96,7 @@ def _picture(values: UInt8[Array, "n c"]) -> bytes:
 
 def read_sog(path: Path) -> Splats:
     """Read the Gaussians of a .sog bundle, with harmonics. Raises UserError for another version, and one of
-    `DAMAGE` for a damaged file."""
-    try:
-        return _read(path)
-    except (zipfile.BadZipFile, Image.DecompressionBombError) as error:
-        raise ValueError(error) from error
-
-
-def _read(path: Path) -> Splats:
+    `DAMAGE` or DecompressionBombError for a damaged file."""
     with zipfile.ZipFile(path) as bundle:
         about: dict[str, Any] = json.loads(_member(bundle, "meta.json"))
         if about.get("version") != 2:

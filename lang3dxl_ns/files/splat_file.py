@@ -12,30 +12,65 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.common.files import write_atomically
+from lang3dxl_ns.common.files import expanded, write_atomically
 from lang3dxl_ns.files.glb import encode_glb
 from lang3dxl_ns.files.ply import encode_ply
 from lang3dxl_ns.files.sog import encode_sog
 from lang3dxl_ns.files.spz import encode_spz
+from lang3dxl_ns.query.question import Question
 from lang3dxl_ns.rendering import Splats
+from lang3dxl_ns.scene.georeference import Georeference
 
-_WRITERS: dict[str, Callable[[Splats], bytes]] = {
-    ".ply": encode_ply, ".spz": encode_spz, ".sog": encode_sog, ".glb": encode_glb,
-}  # fmt: skip
 SPLAT_NAMES = ".ply, .spz, .sog or .glb"
 
 
-def write_splats(path: Path, splats: Splats, relevancy: Float[Tensor, " n"] | None = None) -> int:
+def write_splats(
+    path: Path,
+    splats: Splats,
+    relevancy: Float[Tensor, " n"] | None = None,
+    place: Georeference | None = None,
+) -> int:
     """Write a .ply, .spz, .sog or .glb file, without Gaussians that have a NaN or infinite value, and return
     the number of those written. relevancy: each Gaussian's to a prompt, 0…1, written to a PLY as the property
-    `relevancy`. Raises UserError if the ending names another kind of file, or .spz cannot hold such
-    coordinates."""
+    `relevancy`. place: meters, up and north, for a .glb's node and a comment of a PLY. Raises UserError if
+    the ending names another kind of file, or .spz cannot hold such coordinates."""
     check_splat_name(path)
     sound = splats.sound()
     splats, relevancy = splats.select(sound), None if relevancy is None else relevancy[sound]
-    kind = path.suffix.lower()
-    write_atomically(path, encode_ply(splats, relevancy) if kind == ".ply" else _WRITERS[kind](splats))
+    writers: dict[str, Callable[[Splats], bytes]] = {
+        ".ply": partial(encode_ply, relevancy=relevancy, comment=f"{place or ''}"),
+        **{".glb": partial(encode_glb, place=place), ".spz": encode_spz, ".sog": encode_sog},
+    }
+    write_atomically(path, writers[path.suffix.lower()](splats))
     return len(splats)
+
+
+def write_matching(
+    path: Path,
+    splats: Splats,
+    question: Question,
+    everything: bool,
+    index: str | Path | None,
+    solid: Bool[Tensor, " n"] | None = None,
+    place: Georeference | None = None,
+) -> int:
+    """Write the Gaussians that match a question of one prompt, or all with their relevancy; see
+    `Scene.export`. Of these, only `solid` ones are written, if given."""
+    relevancy, keep = question.relevancy[0], question.gaussians[0]
+    if solid is not None:
+        keep = keep & solid
+    if not everything and not keep.any():
+        best, level = float(relevancy.max()), question.thresholds[0]
+        raise UserError(
+            f"no Gaussian matches {question.prompts[0].text!r}: the best reaches {best:.2f}; lower "
+            f"--threshold, now {level:.2f}, or write all with their relevancy (--all)"
+        )
+    written = solid if everything else keep
+    if written is not None:
+        splats, relevancy = splats.select(written), relevancy[written]
+    if index is not None:
+        write_index(expanded(index), keep)
+    return write_splats(path, splats, relevancy, place)
 
 
 def write_index(path: Path, selected: Bool[Tensor, " n"]) -> None:
@@ -52,5 +87,5 @@ def check_splat_name(path: Path) -> None:
     """Raise UserError if the path is a folder, or its name ends in none of `SPLAT_NAMES`."""
     if path.is_dir():
         raise UserError(f"{path} is a folder: name a {SPLAT_NAMES} file in it")
-    if path.suffix.lower() not in _WRITERS:
+    if path.suffix.lower() not in (".ply", ".spz", ".sog", ".glb"):
         raise UserError(f"{path.name} names no kind of splat file: end it in {SPLAT_NAMES}")

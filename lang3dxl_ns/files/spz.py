@@ -1,6 +1,7 @@
 """SPZ, Niantic's compressed splats: versions 1 to 3 in one gzip stream, and version 4 in zstd streams.
 
-A Gaussian takes 8 bits per value, and 24 per coordinate. Records of vendors may follow, which are skipped.
+A Gaussian takes 8 bits per value, and 24 per coordinate. A file may hold records of vendors. Ours is a scene
+file, which other readers skip.
 """
 
 from __future__ import annotations
@@ -8,9 +9,11 @@ from __future__ import annotations
 import gzip
 import struct
 from collections.abc import Iterator
-from io import BufferedIOBase
+from contextlib import contextmanager
+from io import BufferedIOBase, BytesIO
 from math import floor, log2
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch.nn.functional as F
@@ -27,35 +30,60 @@ _HEADER = struct.Struct("<IIIBBBB")
 """Magic, version, number of Gaussians, degree, fractional bits of coordinates, flags, number of streams."""
 _ANTIALIASED, _RECORDS = 1, 2
 """Bits of the flags."""
+_RECORD, _SCENE = struct.Struct("<II"), 0x4C330001
+"""Type and length of a record, and the type of ours: vendor "L3", record 1."""
 _HIGHEST_DEGREE = 4
 
 
 def read_spz(path: Path) -> Splats:
     """Read the Gaussians of a file of any version. No memory is allocated beyond what the header announces.
     Raises UserError for an unknown version or degree, and one of `DAMAGE` for a damaged file."""
+    with _opened(path) as (stream, version, count, degree, bits, flags, streams):
+        if degree > _HIGHEST_DEGREE:
+            raise UserError(f"its harmonics have degree {degree}; 0 to 4 can be read: export it anew")
+        expect(bits <= 24, f"its coordinates have {bits} fractional bits")
+        check_memory(count, ALL_BANDS)
+        sides = _sides(version, degree)
+        if version < 4:
+            parts = [_exactly(stream, count * side) for side in sides]
+            expect(bool(flags & _RECORDS) or not stream.read(1), _MORE)
+        else:
+            parts = _zstd_parts(stream.read(), [count * side for side in sides if side], streams)
+        return _decoded(parts, count, version, bits, flags)
+
+
+def scene_record(path: Path) -> bytes | None:
+    """Read the scene file in a file; None if there is none. Raises what `read_spz` does."""
+    with _opened(path) as (stream, version, count, degree, _, flags, _):
+        if version < 4:  # records end the stream; in version 4 they follow the header of 32 bytes
+            stream.seek(_HEADER.size + count * sum(_sides(version, degree)))
+        else:
+            start = struct.unpack("<I", _exactly(stream, 4))[0]
+            stream = BytesIO(stream.read()[12 : max(start - 20, 12)])
+        largest = 100 * path.stat().st_size  # nothing that a scene holds packs so well
+        while flags & _RECORDS and len(head := stream.read(_RECORD.size)) == _RECORD.size:
+            kind, size = _RECORD.unpack(head)
+            expect(size <= largest, _MORE)
+            content = _exactly(stream, size)
+            if kind == _SCENE:
+                return content
+    return None
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[tuple[Any, ...]]:
+    """Open a file of any version: its unpacked stream after the header, and the header's numbers."""
     with path.open("rb") as file:
         packed = file.read(2) == b"\x1f\x8b"
         file.seek(0)
-        unpacked = gzip.open(file) if packed else file  # noqa: SIM115
-        with unpacked as stream:
+        with gzip.open(file) if packed else file as stream:
             head = stream.read(_HEADER.size)
             expect(len(head) == _HEADER.size, "its header is cut short")
-            magic, version, count, degree, bits, flags, streams = _HEADER.unpack(head)
+            magic, version, *numbers = _HEADER.unpack(head)
             expect(magic == _MAGIC, "it doesn't begin like an SPZ")
             if version != 4 if not packed else not 1 <= version <= 3:
                 raise UserError(f"it is SPZ of version {version}; 1 to 4 can be read: save it as one of them")
-            if degree > _HIGHEST_DEGREE:
-                raise UserError(f"its harmonics have degree {degree}; 0 to 4 can be read: export it anew")
-            expect(bits <= 24, f"its coordinates have {bits} fractional bits")
-            check_memory(count, ALL_BANDS)
-            sides = _sides(version, degree)
-            if packed:
-                parts = [_exactly(stream, count * side) for side in sides]
-                expect(bool(flags & _RECORDS) or not stream.read(1), _MORE)
-            else:
-                sizes = [count * side for side in sides if side]
-                parts = _zstd_parts(stream.read(), sizes, streams)
-            return _decoded(parts, count, version, bits, flags)
+            yield stream, version, *numbers
 
 
 _MORE = "it unpacks to more than its header announces"
@@ -139,17 +167,19 @@ def _quats_of_three(turns: UInt8[Array, "n 4"]) -> Float32[Array, "n 4"]:
     return np.roll(parts, 1, axis=1)
 
 
-def encode_spz(splats: Splats) -> bytes:
-    """Encode version 3. Raises UserError for coordinates too large for 24 bits."""
+def encode_spz(splats: Splats, record: bytes | None = None) -> bytes:
+    """Encode version 3. record: content of the scene's file. Raises UserError for coordinates too large for
+    24 bits."""
     farthest = float(splats.means.abs().max()) if len(splats) else 0.0
     bits = min(floor(22 - log2(max(farthest, 1e-3))), 20)
     if bits < 0:
         raise UserError(
             f".spz holds coordinates up to 4 million, and these reach {farthest:,.0f}: write a .ply"
         )
-    flags = _ANTIALIASED * splats.antialiased
+    flags = _ANTIALIASED * splats.antialiased + _RECORDS * (record is not None)
     head = _HEADER.pack(_MAGIC, 3, len(splats), splats.degree, bits, flags, 0)
-    return gzip.compress(head + b"".join(_encoded(splats, bits)))
+    last = b"" if record is None else _RECORD.pack(_SCENE, len(record)) + record
+    return gzip.compress(head + b"".join(_encoded(splats, bits)) + last)
 
 
 def _encoded(splats: Splats, bits: int) -> Iterator[bytes]:

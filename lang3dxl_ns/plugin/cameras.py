@@ -10,7 +10,7 @@ from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.scene.camera import Camera, Lens, view_matrix
+from lang3dxl_ns.scene.camera import Lens
 from lang3dxl_ns.training.state import PhotoCamera
 
 
@@ -38,18 +38,8 @@ def lens_of(cameras: Cameras, index: int) -> Lens:
     return Lens(int(cameras.width[index]), int(cameras.height[index]), fx, fy, cx, cy, distortion)
 
 
-def to_rasterizer(camera: Cameras, pose: Float[Tensor, "3 4"] | None = None) -> Camera:
-    """Convert a nerfstudio camera for the rasterizer, at its own or a refined pose (camera → world)."""
-    return Camera(
-        view_matrix=view_matrix(camera.camera_to_worlds[0] if pose is None else pose),
-        intrinsics=camera.get_intrinsics_matrices()[0],
-        width=int(camera.width.item()),
-        height=int(camera.height.item()),
-    )
-
-
 def photo_camera(camera: Cameras) -> PhotoCamera:
-    """Convert a nerfstudio camera for a training step."""
+    """Convert a nerfstudio camera for a training step, and for the rasterizer (`PhotoCamera.camera`)."""
     return PhotoCamera(
         camera.camera_to_worlds[0],
         camera.get_intrinsics_matrices()[0],
@@ -60,7 +50,8 @@ def photo_camera(camera: Cameras) -> PhotoCamera:
 
 
 def to_cameras(view: PhotoCamera) -> Cameras:
-    """Convert a photo's camera to nerfstudio's, which a training step converts back (`photo_camera`)."""
+    """Convert a photo's camera to nerfstudio's, which a training step converts back (`photo_camera`). It
+    stays on the CPU, since the host reads its size and would wait for a GPU."""
     k = view.intrinsics[None]
     lens = k[:, 0, 0], k[:, 1, 1], k[:, 0, 2], k[:, 1, 2]
     camera = Cameras(view.pose[None], *lens, torch.tensor([view.width]), torch.tensor([view.height]))

@@ -35,14 +35,13 @@ from lang3dxl_ns.plugin.photo_dataset import PhotoDataset
 from lang3dxl_ns.preparation.needs import needs_table
 from lang3dxl_ns.preparation.settings import PreparationConfig
 from lang3dxl_ns.preparation.store import FeatureStore
-from lang3dxl_ns.preparation.targets import Batch, SceneFacts
+from lang3dxl_ns.preparation.targets import FACTS, Batch, SceneFacts
 from lang3dxl_ns.preparation.working_photos import WorkingPhotos
 from lang3dxl_ns.scene.camera import LONGEST_SIDE
 from lang3dxl_ns.scene.capture import Capture
 from lang3dxl_ns.scene.companions import cache_folder
 from lang3dxl_ns.scene.record import SCENE_FILE, SceneRecord
-from lang3dxl_ns.training.batches import TrainingData, settle
-from lang3dxl_ns.training.state import PhotoCamera
+from lang3dxl_ns.training.batches import TrainingData
 
 
 @without(*OF_IMAGE_CACHES)
@@ -76,11 +75,6 @@ class Lang3DXLDataManagerConfig(PreparationConfig, FullImageDatamanagerConfig):
         super().check()
         check_numbers(self, _BOUNDS, "--pipeline.datamanager.")
         check_numbers(self.dataparser, {n: b for n, b in _OF_PARSER.items() if hasattr(self.dataparser, n)})
-
-    def settle_targets(self, learned: bool, gathered: bool) -> None:
-        """Resolve what is prepared as `batches.settle`, and whether steps read targets."""
-        self.targets_in_steps = learned
-        settle(self, learned, gathered)
 
 
 _BOUNDS = {"camera_res_scale_factor": (0.001, 8), "cache_gb": (0, 1e6), "read_ahead": (0, 1000)}
@@ -142,7 +136,7 @@ class Lang3DXLDataManager(FullImageDatamanager):
         )  # fmt: skip
         dataset = self._dataset(self.train_dataparser_outputs, capture.split.train)
         positions = dataset.cameras.camera_to_worlds[..., 3]
-        SceneFacts(list(capture.split.train), positions).into(dataset.metadata)
+        dataset.metadata[FACTS] = SceneFacts(list(capture.split.train), positions)
         return dataset
 
     def create_eval_dataset(self) -> PhotoDataset:
@@ -167,7 +161,7 @@ class Lang3DXLDataManager(FullImageDatamanager):
         """Prepare missing targets before training; give the model their statistics and the scene's needs."""
         if self.test_mode == "val":
             say(needs_table(self.data.needs))
-            self.data.facts().into(self.train_dataset.metadata)
+            self.train_dataset.metadata[FACTS] = self.data.facts()
 
     def sample_train_cameras(self) -> list[int]:
         """Return all training photos; `data` has their order."""
@@ -177,7 +171,8 @@ class Lang3DXLDataManager(FullImageDatamanager):
         """Return camera and batch of the next training photo; every photo appears once per round. A photo
         found to be damaged is left out from then on, and logged."""
         with part("data"):
-            return _for_nerfstudio(*self.data.next())
+            view, batch = self.data.next()
+            return to_cameras(view), batch
 
     def next_eval_image(self, step: int) -> tuple[Cameras, Batch]:  # type: ignore[override]
         """Return camera and batch of a held-out photo, in turn."""
@@ -196,14 +191,8 @@ class Lang3DXLDataManager(FullImageDatamanager):
 
     def read(self, names: Iterable[str]) -> Iterator[tuple[Cameras, Batch]]:
         """Yield camera and batch, with targets, of photos by name, as `TrainingData.read` does."""
-        return (_for_nerfstudio(view, batch) for view, batch in self.data.read(names))
+        return ((to_cameras(view), batch) for view, batch in self.data.read(names))
 
     def get_train_rays_per_batch(self) -> int:
         """Return the pixels of a typical photo, for nerfstudio's speed display."""
         return int((self.train_dataset.cameras.width * self.train_dataset.cameras.height).float().mean())
-
-
-def _for_nerfstudio(view: PhotoCamera, batch: Batch) -> tuple[Cameras, Batch]:
-    """Convert a photo's camera. It stays on the CPU, since the host reads its size and would wait for a
-    GPU."""
-    return to_cameras(view), batch

@@ -8,19 +8,20 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from nerfstudio.data.scene_box import SceneBox
 
 from lang3dxl_ns.common.device import known_device
 from lang3dxl_ns.common.errors import UserError, readable
 from lang3dxl_ns.evaluation.score_run import NOT_FINISHED
 from lang3dxl_ns.files.runs import find_config
-from lang3dxl_ns.plugin.model import Lang3DXLModel, Lang3DXLModelConfig
+from lang3dxl_ns.plugin.model import Lang3DXLModelConfig
 from lang3dxl_ns.plugin.run_checkpoint import latest_checkpoint
 from lang3dxl_ns.plugin.run_settings import read_model_config
 from lang3dxl_ns.preparation.targets import SceneFacts
 from lang3dxl_ns.query.question import QueryConfig
 from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.scene.record import SCENE_FILE, SceneRecord
+from lang3dxl_ns.training.snapshot import snapshot
+from lang3dxl_ns.training.state import Training
 
 
 def load_run(
@@ -48,26 +49,19 @@ def load_run(
     path, checkpoint = latest_checkpoint(folder / checkpoints)
     if not isinstance(settings, Lang3DXLModelConfig):
         raise UserError(f"{folder} is a run of another method: train one with ns-train lang3dxl")
-    names, metadata = [photo.name for photo in file.photos if photo.split == "train"], dict[str, Any]()
-    SceneFacts(names).into(metadata)
     # The checkpoint brings its own Gaussians, so start with as few as possible.
     start = replace(settings, sky_gaussians=0, random_init=False)  # type: ignore[call-arg]
-    model = start.setup(
-        scene_box=SceneBox(torch.tensor([[-1.0] * 3, [1.0] * 3])),
-        num_train_data=len(names),
-        metadata=metadata,
-        device=worker,
-        grad_scaler=None,
-        seed_points=(torch.eye(4)[:, :3], torch.zeros(4, 3)),
-    )
-    assert isinstance(model, Lang3DXLModel)
+    start.fit_to_run(start.total_steps)
+    facts = SceneFacts([photo.name for photo in file.photos if photo.split == "train"])
+    model = Training.begin(start, facts, (torch.eye(4)[:, :3], torch.zeros(4, 3)))
     with readable(f"the checkpoint {path} does not fit the config.yml beside it", "copy both from one run"):
-        model.load_state_dict(model_state(checkpoint["pipeline"]), strict=True)
-    if model.semantic_field is not None and model.carried is None:
+        model.load(model_state(checkpoint["pipeline"]))
+    if model.parts.semantics is not None and model.carried is None:
         raise UserError(NOT_FINISHED)
-    model.to(worker).eval()
+    model.to(worker)
+    model.step = start.total_steps
     file = replace(file, clip=clip or file.clip)
-    return model.scene(file, config=config, cache=folder / "lang3dxl_visible.safetensors")
+    return snapshot(model, file, config=config, cache=folder / "lang3dxl_visible.safetensors")
 
 
 def model_state(state: Mapping[str, Any]) -> dict[str, Any]:

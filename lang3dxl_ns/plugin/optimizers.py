@@ -38,10 +38,6 @@ class RunSchedule(Scheduler):
     def get_scheduler(self, optimizer: Optimizer, lr_init: float) -> LambdaLR:
         return self.config.scheduler(optimizer)
 
-    def multiple(self, step: int) -> float:
-        """Compute the multiple of the rate at an iteration."""
-        return self.config.multiple(step)
-
 
 def parameter_groups(rates: Rates) -> dict[str, dict]:
     """Convert rates and schedules to nerfstudio's settings of the parameter groups."""

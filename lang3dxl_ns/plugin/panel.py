@@ -18,13 +18,14 @@ from numpy import ndarray as Array
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.worker import Worker
 from lang3dxl_ns.plugin.conversation import Conversation, plain
-from lang3dxl_ns.plugin.rendering_model import RenderingModel
+from lang3dxl_ns.plugin.model import Lang3DXLModel
 from lang3dxl_ns.plugin.viewer_guard import guard_viewers
 from lang3dxl_ns.query.match import Found
 from lang3dxl_ns.scene.camera import Camera
 from lang3dxl_ns.scene.record import SceneRecord, overview
 
 if TYPE_CHECKING:
+    from nerfstudio.engine.trainer import Trainer
     from nerfstudio.viewer.viewer import Viewer
 
 INVITATION = (
@@ -40,7 +41,7 @@ class Asked(Protocol):
     """What the panel asks of a pipeline, whose module imports this one."""
 
     @property
-    def model(self) -> RenderingModel: ...
+    def model(self) -> Lang3DXLModel: ...
 
     @property
     def scene_file(self) -> SceneRecord: ...
@@ -226,14 +227,7 @@ def stand_of(
     return position, position + max(ahead, 0.05) * forward, fov
 
 
-class _Trains(Protocol):
-    """Trainer that tells whether it still changes its model."""
-
-    @property
-    def training_state(self) -> str: ...
-
-
-def _changes(trainer: _Trains | None) -> bool:
+def _changes(trainer: Trainer | None) -> bool:
     """Return whether training still changes its model; None: there is no training."""
     if trainer is None or trainer.training_state == "completed":
         return False

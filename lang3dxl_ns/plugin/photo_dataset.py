@@ -14,6 +14,7 @@ from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.plugin.cameras import to_nerfstudio
 from lang3dxl_ns.preparation.working_photos import WorkingPhotos
 from lang3dxl_ns.scene.photo import Photo
+from lang3dxl_ns.training.batches import read_data
 
 
 class PhotoDataset(InputDataset):
@@ -29,12 +30,7 @@ class PhotoDataset(InputDataset):
 
     def read(self, index: int) -> dict[str, Tensor]:
         """Read a photo: `image` [h, w, 3] uint8 and, if the photo has one, `mask` [h, w, 1] bool."""
-        photo = self.photos[index]
-        data = {"image": self.working.read(photo, self.scale)}
-        mask = self.working.mask(photo, self.scale)
-        if mask is not None:
-            data["mask"] = mask[..., None]
-        return data
+        return read_data(self.photos[index], self.working, self.scale, None)
 
     def get_data(self, image_idx: int, image_type: str = "float32") -> dict:
         try:

@@ -23,9 +23,8 @@ from lang3dxl_ns.evaluation.score_run import Evaluation, EvaluationSettings
 from lang3dxl_ns.plugin.datamanager import Lang3DXLDataManager, Lang3DXLDataManagerConfig
 from lang3dxl_ns.plugin.dataparser import RecordedSceneDataParserConfig
 from lang3dxl_ns.plugin.load_scene import model_state
-from lang3dxl_ns.plugin.model import Lang3DXLModel, Lang3DXLModelConfig
+from lang3dxl_ns.plugin.model import Lang3DXLModel, Lang3DXLModelConfig, RenderedAnswers
 from lang3dxl_ns.plugin.panel import AskPanel
-from lang3dxl_ns.plugin.rendering_model import RenderedAnswers
 from lang3dxl_ns.scene.record import SCENE_FILE, SceneRecord
 from lang3dxl_ns.training.learn_codes import learn_words
 
@@ -121,11 +120,6 @@ class Lang3DXLPipeline(VanillaPipeline):
             CONSOLE.log(f"Looking for {escape(self.query)}")
             scene = self.model.scene(self.scene_file, cache=cache)
             self.model.answers = RenderedAnswers(scene.ask(self.query))
-
-    @property
-    def has_words_to_learn(self) -> bool:
-        """Whether semantics are learned after the last iteration instead of from renderings."""
-        return self.model.run.learns_words_at_the_end
 
     def learn_words(self) -> None:
         """Gather the training photos' features onto the present Gaussians, and learn codes."""

@@ -156,17 +156,15 @@ class Lang3DXLTrainer(Trainer):
             self.config.data = data
         for optimizer in self.optimizers.optimizers.values():
             add_rows_to_state(optimizer)
-        if self.local_rank == 0:
-            self.pipeline.datamanager.data.record().write(self.base_dir / SCENE_FILE)
-            if test_mode == "val":
-                write_needs(self.pipeline.datamanager.data.needs, self.base_dir)
-        model, cameras = self.pipeline.model, self.pipeline.datamanager.train_dataset.cameras
-        pixels, wanted = int((cameras.width * cameras.height).max()), self.config.pipeline.model.max_gaussians
-        model.run.densification.most, message = plan(model.run, pixels, torch.device(self.device), wanted)
-        CONSOLE.log(escape(message))
+        photos, run = self.pipeline.datamanager.data, self.pipeline.model.run
+        photos.record().write(self.base_dir / SCENE_FILE)
+        if test_mode == "val":
+            write_needs(photos.needs, self.base_dir)
+        CONSOLE.log(escape(plan(run, photos.cameras)))
         torch.manual_seed(self.config.machine.seed)
         if self._run_state is not None:
-            _restore(self.pipeline, self._run_state)
+            photos.restore(self._run_state["photos"])
+            run.restore(self._run_state)
 
     def _forget_folder(self) -> None:
         """Remove the folder of a run that could not start, if it holds nothing but what is written before
@@ -264,7 +262,7 @@ class Lang3DXLTrainer(Trainer):
     @property
     def is_finished(self) -> bool:
         """Whether the loaded checkpoint has all iterations, and the words if they are learned after them."""
-        words = self.words_are_learned or not self.pipeline.has_words_to_learn
+        words = self.words_are_learned or not self.pipeline.model.run.learns_words_at_the_end
         beyond = self._start_step - self.config.max_num_iterations
         return beyond > 0 or (beyond == 0 and words)
 
@@ -364,7 +362,7 @@ class Lang3DXLTrainer(Trainer):
         self.stages.end()
         if self.interrupted:
             self.step = max(self._last_iteration, 0)  # not the iteration that was about to begin
-        elif self.pipeline.has_words_to_learn:
+        elif self.pipeline.model.run.learns_words_at_the_end:
             self.save_checkpoint(self.step)
             self._learn_words()
         if self.interrupted:
@@ -425,7 +423,7 @@ class Lang3DXLTrainer(Trainer):
             "optimizers": {name: o.state_dict() for name, o in self.optimizers.optimizers.items()},
             "schedulers": {name: s.state_dict() for name, s in self.optimizers.schedulers.items()},
             "scalers": self.grad_scaler.state_dict(),
-            "run": _run_state(self.pipeline),
+            "run": self.pipeline.model.run.progress() | {"photos": self.pipeline.datamanager.data.state()},
             "words": self.words_are_learned,
         }
         try:
@@ -439,18 +437,7 @@ class Lang3DXLTrainer(Trainer):
             for other in set(self.checkpoint_dir.glob("*.ckpt")) - {path}:
                 other.unlink()
         done = step + 1 >= self.config.pipeline.model.total_steps and (
-            self.words_are_learned or not self.pipeline.has_words_to_learn
+            self.words_are_learned or not self.pipeline.model.run.learns_words_at_the_end
         )
         if self._is_ending and not self.interrupted and done:
             self.write_scene()
-
-
-def _run_state(pipeline: Lang3DXLPipeline) -> dict[str, Any]:
-    """Collect the run's progress and the current round through the photos."""
-    return pipeline.model.run.progress() | {"photos": pipeline.datamanager.data.state()}
-
-
-def _restore(pipeline: Lang3DXLPipeline, state: dict[str, Any]) -> None:
-    """Restore `_run_state` on the pipeline's device, whichever device it was saved from."""
-    pipeline.datamanager.data.restore(state["photos"])
-    pipeline.model.run.restore(state)

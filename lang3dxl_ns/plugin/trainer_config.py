@@ -29,6 +29,7 @@ from lang3dxl_ns.preparation.model_files import BUILTIN, check_encoders
 from lang3dxl_ns.preparation.needs import read_needs
 from lang3dxl_ns.scene.photo_folder import check_data
 from lang3dxl_ns.scene.record import SCENE_FILE
+from lang3dxl_ns.training.batches import settle
 from lang3dxl_ns.training.estimate import check_device
 from lang3dxl_ns.web.access import is_local
 
@@ -142,7 +143,8 @@ class Lang3DXLTrainerConfig(RunConfig):
         self.steps_per_save = min(self.steps_per_save, max(iterations // 4, 1))
         datamanager = self.pipeline.datamanager
         learned = self.pipeline.model.decoder.learns_from_renderings
-        datamanager.settle_targets(learned, not learned or self.pipeline.model.codes_from == "photos")
+        datamanager.targets_in_steps = learned
+        settle(datamanager, learned, not learned or self.pipeline.model.codes_from == "photos")
         for name in ("clip", "dense", "sam", "foreground_model"):
             choice = getattr(datamanager, name)
             if choice not in (BUILTIN, "none", "auto") and expanded(choice).is_dir():

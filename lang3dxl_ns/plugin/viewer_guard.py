@@ -1,8 +1,8 @@
 """nerfstudio's viewer, for this machine alone.
 
-viser 0.2.7 serves any file of the machine, to pages of any origin, and has no option for either. So
-`guard_viewers` puts a check before every request to the servers that this process starts.
-docs/troubleshooting.md lists what it allows.
+viser 0.2.7 serves any file of the machine, to pages of any origin, and has no option for either; and it
+counts a client whose message it can't read forever. So `guard_viewers` puts a check before every request and
+message to the servers that this process starts. docs/troubleshooting.md lists what it allows.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from typing import Any
 import viser.infra._infra as infra
 import websockets.server
 from viser import _messages
+from websockets.exceptions import ConnectionClosed
 
 from lang3dxl_ns.common.console import say
 from lang3dxl_ns.web.access import Access, is_local
@@ -32,6 +33,7 @@ def guard_viewers() -> None:
     """Keep every further viser server of this process on this machine, and its files to those of its page."""
     module: Any = websockets.server
     serve, handle = module.serve, infra.WebsockMessageHandler._handle_incoming_message
+    consume: Any = infra._message_consumer
     if getattr(serve, "is_guarded", False):
         return
 
@@ -46,8 +48,18 @@ def guard_viewers() -> None:
         if not isinstance(message, _messages.ViewerCameraMessage) or 0.02 < message.aspect < 50:
             handle(self, client_id, message)
 
+    async def guarded_consume(websocket: Any, *rest: Any) -> None:
+        try:
+            await consume(websocket, *rest)
+        except ConnectionClosed:
+            raise
+        except Exception:  # whatever viser's reading fails with: this is no message of its page
+            await websocket.close(1007)
+            await websocket.recv()  # raises what viser takes for the end of a connection
+
     guarded_serve.is_guarded = True  # type: ignore[attr-defined]
     module.serve = guarded_serve
+    infra._message_consumer = guarded_consume  # type: ignore[assignment]
     infra.WebsockMessageHandler._handle_incoming_message = guarded_handle  # type: ignore[method-assign]
 
 

@@ -167,11 +167,7 @@ class _Maker:
     """Setup of a worker that makes entries."""
 
     def __init__(
-        self,
-        config: PreparationConfig,
-        store: FeatureStore,
-        regions: RegionSource | None,
-        tasks: list[_Task],
+        self, config: PreparationConfig, store: FeatureStore, regions: RegionSource | None, tasks: list[_Task]
     ) -> None:
         self._config, self._store, self._regions, self._tasks = config, store, regions, tasks
         self._kinds = {target.kind for task in tasks for target in task.missing}

@@ -18,7 +18,8 @@ from lang3dxl_ns.preparation.store import FeatureStore, PhotosGoneError
 CLIP, FINE, DENSE, REGIONS = "clip", "clip_fine", "dense", "regions"
 
 _STD_FLOOR = 0.01
-_KEY = "lang3dxl"
+FACTS = "lang3dxl"
+"""Key of a scene's facts in a dataset's metadata, which nerfstudio hands to the model."""
 
 
 @dataclass
@@ -180,12 +181,3 @@ class SceneFacts:
         """Return whether to build a component (named as in `needs`) for a setting: `on`, `off`, or `auto`,
         for which its need decides, or `unmeasured` if that is unknown."""
         return self.needs.get(component, unmeasured) if choice == "auto" else choice == "on"
-
-    def into(self, metadata: dict[str, Any]) -> None:
-        """Put the facts into a dataset's metadata, which nerfstudio hands to the model."""
-        metadata[_KEY] = self
-
-    @staticmethod
-    def of(metadata: Mapping[str, Any]) -> SceneFacts:
-        """Return the facts in a dataset's metadata, or empty ones."""
-        return metadata.get(_KEY) or SceneFacts()

@@ -37,7 +37,7 @@ def matches(scene: Answering, question: Question, place: Place, size: int | None
     view = scene.view(place, camera, channels=None if enlarged else channels)
     rendered, rendering = time.perf_counter(), view.rendering
     if enlarged:
-        rendering = replace(rendering, channels=composite(scene.splats, small, channels, scene.backend))
+        rendering = replace(rendering, channels=composite(scene.splats, small, channels))
     foreground = None if view.name is None else scene.file.photo(view.name).foreground()
     maps, masks = question.maps(rendering, foreground)
     found = maps.cpu().float().numpy(), masks.cpu().numpy()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Protocol, TypeAlias
 
 import torch
@@ -17,7 +17,7 @@ from lang3dxl_ns.query.match import View
 from lang3dxl_ns.query.question import QueryConfig, Question
 from lang3dxl_ns.query.text import Prompt, TextEncoder
 from lang3dxl_ns.query.visibility import VisibleGaussians
-from lang3dxl_ns.rendering import Backend, Rendering, Splats
+from lang3dxl_ns.rendering import Rendering, Splats
 from lang3dxl_ns.scene.camera import Camera
 from lang3dxl_ns.scene.record import ScenePhoto, SceneRecord
 from lang3dxl_ns.words.taught_words import TaughtWord
@@ -33,7 +33,6 @@ class Answering(Protocol):
     file: SceneRecord
     words: Mapping[str, TaughtWord]
     config: QueryConfig
-    backend: Backend
 
     @property
     def device(self) -> torch.device: ...
@@ -64,5 +63,5 @@ class Answering(Protocol):
         channels: Float[Tensor, "n d"] | None = None,
     ) -> View: ...
     def fill(self, camera: Camera, weight: Float[Tensor, "h w"]) -> Float[Tensor, " n"]: ...
-    def ask(self, texts: str) -> Question: ...
+    def ask(self, texts: str | Sequence[str]) -> Question: ...
     def synonyms(self, prompt: Prompt) -> list[str]: ...

@@ -21,26 +21,25 @@ from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import expanded
 from lang3dxl_ns.components.appearance import AppearanceField, Look, render_in_look
 from lang3dxl_ns.components.feature_decoder import Decoder
-from lang3dxl_ns.files.matching_splat import write_matching
-from lang3dxl_ns.files.splat_file import write_splats
+from lang3dxl_ns.files.splat_file import write_matching, write_splats
 from lang3dxl_ns.preparation.encoders import load_image_text_encoder
 from lang3dxl_ns.query import answer
 from lang3dxl_ns.query.answering import Place
-from lang3dxl_ns.query.doubt import DOUBTFUL, Doubts, doubtful, peaks
+from lang3dxl_ns.query.doubt import DOUBTFUL, Doubts, doubtful, match_thresholds, matching, peaks
 from lang3dxl_ns.query.engine import QueryEngine, make_engine
 from lang3dxl_ns.query.floaters import FLOATS, floating
 from lang3dxl_ns.query.match import Found, Match, View
 from lang3dxl_ns.query.question import QueryConfig, Question
 from lang3dxl_ns.query.relevancy import Queries
 from lang3dxl_ns.query.text import EncodeTexts, Prompt, TextEncoder, listed_phrases, parse_prompts, texts_of
-from lang3dxl_ns.query.thresholds import match_thresholds, matching
 from lang3dxl_ns.query.trust import ANCHORS, alike, foreignness, judged
 from lang3dxl_ns.query.visibility import VisibleGaussians, measured, median_distance, total_pixels
 from lang3dxl_ns.query.vocabulary import closest_word, common_words, searched, shipped_vocabulary
-from lang3dxl_ns.rendering import Backend, Rendering, Splats, composite
+from lang3dxl_ns.rendering import Rendering, Splats, composite
 from lang3dxl_ns.rendering.gathering import filled_pixels
 from lang3dxl_ns.scene.camera import Camera, posed, resized, with_field_of_view, with_longer_side
 from lang3dxl_ns.scene.record import ScenePhoto, SceneRecord, overview, same_clip
+from lang3dxl_ns.things.find import Things, things_of
 from lang3dxl_ns.words.taught_words import Example, TaughtWord, known_word
 from lang3dxl_ns.words.teach import carried_word, learned_word, least_certain_photo
 
@@ -85,8 +84,6 @@ class Scene:
     """Defaults of queries, sizes of pictures, and of the views that `visible` measures."""
     cache: Path | None = None
     """File that keeps which Gaussians the photos show; if None, every process measures them."""
-    backend: Backend = "auto"
-    """The rasterizer, see `rasterize`."""
     watch: Callable[[str], None] | None = None
     """Called with a short description of slow work; if None, a progress bar is shown."""
     _doubt_alone: dict[str, float] = field(default_factory=dict, init=False)
@@ -153,9 +150,7 @@ class Scene:
         look, the scene's rule chooses the lighting for this view."""
         if look is None and self.looks is not None:
             look = self.looks.of_view(camera)
-        return render_in_look(
-            self.splats, camera, look, channels, background=self.background, backend=self.backend
-        )
+        return render_in_look(self.splats, camera, look, channels, background=self.background)
 
     def view(
         self,
@@ -383,13 +378,11 @@ class Scene:
             UserError: nothing matches, or see `ask` and `write_splats`.
         """
         splats = self.baked(look)
-        solid = self.floating <= FLOATS if hide_floaters else self.splats.opacities >= 0
+        path, place = expanded(path), self.file.georeference
+        solid = self.floating <= FLOATS if hide_floaters else None
         if text is None:
-            return write_splats(expanded(path), splats.select(solid) if hide_floaters else splats)
-        question = self._one(text, threshold)
-        return write_matching(
-            expanded(path), splats, question, everything, index, solid if hide_floaters else None
-        )
+            return write_splats(path, splats if solid is None else splats.select(solid), place=place)
+        return write_matching(path, splats, self._one(text, threshold), everything, index, solid, place)
 
     # ── what the photos show ────────────────────────────────────────────────────────────────────────
 
@@ -402,13 +395,12 @@ class Scene:
             self.config.views,
             self.config.view_side,
             cache=self.cache,
-            backend=self.backend,
             watch=self.watch,
         )
 
     def fill(self, camera: Camera, weight: Float[Tensor, "h w"]) -> Float[Tensor, " n"]:
         """Compute how many of a camera's pixels, each of a weight 0…1, every Gaussian fills."""
-        drawn = partial(composite, self.splats, camera, backend=self.backend)
+        drawn = partial(composite, self.splats, camera)
         return filled_pixels(drawn, weight, len(self.splats))
 
     @cached_property
@@ -467,6 +459,10 @@ class Scene:
         """
         words = shipped_vocabulary() if words is None else texts_of(words, "a word")
         return answer.words_at(self, self.camera(place, size), x, y, words, most)
+
+    def things(self, texts: str | Sequence[str]) -> list[Things]:
+        """Find the single things that each prompt names: windows, portals, towers. See `things_of`."""
+        return things_of(self, texts)
 
     # ── words taught by example ─────────────────────────────────────────────────────────────────────
 

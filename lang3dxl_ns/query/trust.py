@@ -111,10 +111,7 @@ def least_peak(foreign: float | None) -> float:
 
 
 def alike(
-    text: str,
-    synonyms: Sequence[str],
-    selected: Bool[Tensor, " n"],
-    anchors: Bool[Tensor, "anchors n"],
+    text: str, synonyms: Sequence[str], selected: Bool[Tensor, " n"], anchors: Bool[Tensor, "anchors n"]
 ) -> list[str]:
     """List the `ANCHORS` that select the same Gaussians as a prompt, but for words that mean the same."""
     common, either = (selected & anchors).sum(1), (selected | anchors).sum(1)

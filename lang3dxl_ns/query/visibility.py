@@ -17,7 +17,7 @@ from torch import Tensor
 from lang3dxl_ns.common.console import say, tracked
 from lang3dxl_ns.common.files import check_regular, replace_file
 from lang3dxl_ns.preparation.store import hash_tensors
-from lang3dxl_ns.rendering import Backend, Splats, composite
+from lang3dxl_ns.rendering import Splats, composite
 from lang3dxl_ns.rendering.gathering import filled_pixels
 from lang3dxl_ns.scene.camera import Camera, resized
 from lang3dxl_ns.scene.record import SceneRecord
@@ -67,7 +67,6 @@ def measured(
     side: int,
     *,
     cache: Path | None = None,
-    backend: Backend = "auto",
     watch: Callable[[str], None] | None = None,
 ) -> Mapping[str, VisibleGaussians]:
     """Measure which Gaussians at most `most` training views show, `side` pixels long, unless the `cache` has
@@ -87,7 +86,7 @@ def measured(
         size = camera.height, camera.width
         mask = record.photo(name).foreground(size)
         weight = torch.ones(size) if mask is None else mask.float()
-        drawn = partial(composite, splats, camera, backend=backend)
+        drawn = partial(composite, splats, camera)
         filled = filled_pixels(drawn, weight.to(splats.means.device), len(splats))
         views[name] = VisibleGaussians.of(camera, filled)
     if cache is not None and views:

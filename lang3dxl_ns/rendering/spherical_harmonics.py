@@ -54,9 +54,7 @@ def _basis(degree: int, directions: Float[Tensor, "n 3"]) -> Float[Tensor, "n k"
 
 @in_full_precision
 def spherical_harmonics(
-    degree: int,
-    directions: Float[Tensor, "n 3"],
-    coefficients: Float[Tensor, "n k 3"],
+    degree: int, directions: Float[Tensor, "n 3"], coefficients: Float[Tensor, "n k 3"]
 ) -> Float[Tensor, "n 3"]:
     """Evaluate one color per Gaussian from its coefficients; the caller adds 0.5 and clamps. Directions
     (camera center to Gaussian, world frame) may have any length. Bands above `degree` are ignored. Signs and

@@ -25,6 +25,8 @@ class Splats(Gaussians):
     """Spherical harmonics of the colors, degrees 0 to 3, the constant ones first (k = 1, 4, 9 or 16)."""
     antialiased: bool = False
     """Whether small Gaussians are dimmed by what the screen-space blur adds to their area, as in training."""
+    backend: Backend = "auto"
+    """The rasterizer that draws them, see `rasterize`."""
 
     def __len__(self) -> int:
         return len(self.means)
@@ -89,7 +91,6 @@ def render(
     channels: Float[Tensor, "n d"] | None = None,
     *,
     background: Float[Tensor, "3"] | None = None,
-    backend: Backend = "auto",
 ) -> Rendering:
     """Render Gaussians in their own colors over a background (0…1, by default black), and composite further
     `channels`, one row per Gaussian. This is safe to call from any thread. Raises ValueError like
@@ -102,7 +103,7 @@ def render(
         behind[:3] = background
     raster = rasterize(
         splats.gaussians.seen_from(camera), camera, carried, behind,
-        render_depth=True, antialiased=splats.antialiased, backend=backend,
+        render_depth=True, antialiased=splats.antialiased, backend=splats.backend,
     )  # fmt: skip
     assert raster.depth is not None
     colors, others = raster.image[..., :3].clamp(0.0, 1.0), raster.image[..., 3:]
@@ -111,9 +112,7 @@ def render(
     )
 
 
-def composite(
-    splats: Splats, camera: Camera, channels: Float[Tensor, "n d"], backend: Backend = "auto"
-) -> Float[Tensor, "h w d"]:
+def composite(splats: Splats, camera: Camera, channels: Float[Tensor, "n d"]) -> Float[Tensor, "h w d"]:
     """Composite values of the Gaussians over black, differentiable in the values, without their colors."""
     seen = splats.gaussians.seen_from(camera)
-    return rasterize(seen, camera, channels, antialiased=splats.antialiased, backend=backend).image
+    return rasterize(seen, camera, channels, antialiased=splats.antialiased, backend=splats.backend).image

@@ -24,10 +24,7 @@ _EDGES = [(0, 1), (0, 2), (0, 3), (0, 4), (1, 2), (2, 3), (3, 4), (4, 1)]
 
 
 def camera_picture(
-    poses: Float[Array, "n 3 4"],
-    names: Sequence[str],
-    doubtful: Collection[str],
-    points: Float[Array, "m 3"],
+    poses: Float[Array, "n 3 4"], names: Sequence[str], doubtful: Collection[str], points: Float[Array, "m 3"]
 ) -> Image.Image:
     """Draw cameras as pyramids and points as gray dots: from above on the left, from the side on the right.
 

@@ -124,8 +124,7 @@ class Capture:
             if not names:
                 raise UserError(
                     f"the {part} split of {self.folder} has no photo (of {len(self.photos)} in all): add "
-                    "photos, "
-                    "or choose another split with `lang3dxl-colmap --eval-mode …` after all options"
+                    "photos, or choose another split with `lang3dxl-colmap --eval-mode …` after all options"
                 )
         return Split(train, held_out)
 
@@ -256,8 +255,8 @@ def open_capture(
         first = next(iter(capture.left_out.items()), ("", "it lists none"))
         raise UserError(
             f"none of the {len(capture.left_out)} photos of {folder} can be used; the first: "
-            f"{': '.join(first)}. "
-            "Name the photos' folder with `lang3dxl-colmap --images-path FOLDER` after the other options"
+            f"{': '.join(first)}. Name the photos' folder with `lang3dxl-colmap --images-path FOLDER` after "
+            "the other options"
         )
     return _without_lost_cameras(capture)
 

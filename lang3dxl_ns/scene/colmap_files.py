@@ -89,8 +89,7 @@ def read_model_files(folder: Path) -> ModelFiles:
         missing = f"{', '.join(lacks)} is missing. " if lacks else ""
         raise UserError(
             f"no COLMAP model in {folder}: looked for cameras, images and points3D, .bin or .txt. "
-            f"{missing}Give "
-            "the folder that holds them (usually sparse/0), or make one from photos: "
+            f"{missing}Give the folder that holds them (usually sparse/0), or make one from photos: "
             "lang3dxl reconstruct --data PHOTOS"
         )
     contents = []
@@ -204,8 +203,7 @@ def _text_cameras(path: Path, content: bytes) -> Iterator[tuple[int, ModelCamera
         if len(words) > 1 and model not in _SIZES:
             raise UserError(
                 f"camera {words[0]} in {path} has the camera model {words[1]:.40}, which is unknown: run "
-                "colmap "
-                "image_undistorter and use its images and model"
+                "colmap image_undistorter and use its images and model"
             )
         try:
             width, height = float(words[2]), float(words[3])

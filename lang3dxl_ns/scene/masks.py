@@ -104,8 +104,3 @@ def mask_folder(
                 return MaskFolder(path, follow_links)
     beside = MaskFolder(images, follow_links, beside=True)
     return beside if beside.count else None
-
-
-def find_mask(folder: Path, name: str, follow_links: bool = False) -> Path | None:
-    """Find one photo's mask in a folder, as `MaskFolder.find` does."""
-    return MaskFolder(folder, follow_links).find(name)

@@ -28,12 +28,7 @@ from lang3dxl_ns.common.files import read_json, replace_file
 from lang3dxl_ns.common.image import resize_nearest
 from lang3dxl_ns.scene.camera import Camera, Lens, check_pose, view_matrix
 from lang3dxl_ns.scene.companions import is_name
-from lang3dxl_ns.scene.georeference import (
-    Georeference,
-    georeference,
-    georeference_from_json,
-    gps_position,
-)
+from lang3dxl_ns.scene.georeference import Georeference, georeference, georeference_from_json, gps_position
 from lang3dxl_ns.scene.photo import Photo
 
 SCENE_FILE = "lang3dxl_scene.json"

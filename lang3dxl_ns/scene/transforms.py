@@ -144,8 +144,7 @@ def _photos(folder: Path, content: Mapping[str, Any], frames: list[dict[str, Any
     if scaled := [scale for scale in scales if abs(scale - 1) >= 0.01]:
         say(
             f"{len(scaled)} of {len(scales)} poses in {folder / TRANSFORMS} have axes of other lengths than "
-            "1 "
-            f"(such as {scaled[0]:.3g}); they are normalized"
+            f"1 (such as {scaled[0]:.3g}); they are normalized"
         )
     return dict(sorted(photos.items())), masks_of, left_out
 
@@ -222,8 +221,7 @@ def _points(name: Any, path: Path) -> tuple[Float64[Array, "m 3"], UInt8[Array, 
         what = f"{path} names points that are not there ({name[:80]})"
     say(
         f"{what}: training starts from random ones, which costs several dB; without this file, the photos "
-        "are "
-        "reconstructed with points"
+        "are reconstructed with points"
     )
     return nothing
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -12,16 +12,16 @@ from jaxtyping import Float
 from numpy import ndarray as Array
 from torch import Tensor
 
+from lang3dxl_ns.query.answering import Answering
 from lang3dxl_ns.query.doubt import doubtful, peaks
-from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.rendering import composite
-from lang3dxl_ns.things.join import VIEWS, Joined, join, without_crumbs
+from lang3dxl_ns.things.join import VIEWS, Joined, join, stacked, without_crumbs
 from lang3dxl_ns.things.pieces import FILLED, LEVELS, Piece, Shown, pieces_of
-from lang3dxl_ns.things.thing import Sighting, Thing, upright_box
+from lang3dxl_ns.things.thing import Box, Sighting, Thing, upright_box
 
 COLORED = 20
 """Number of Gaussians within and around the matches below which colors tell nothing."""
-_KNOWN: WeakKeyDictionary[Scene, list[Thing]] = WeakKeyDictionary()
+_KNOWN: WeakKeyDictionary[Answering, list[Thing]] = WeakKeyDictionary()
 """Things that were found in each scene so far: they keep their ids."""
 SAME = 0.5
 """Overlap (intersection over union of weights) from which two words' things are one."""
@@ -33,12 +33,26 @@ class Things:
 
     word: str
     things: list[Thing]
-    least: int
-    """Number of the things that three or more photos show."""
-    most: int
-    """Number of the things and of all candidates: those that a single photo shows, and small ones."""
+    candidates: list[Thing] = field(default_factory=list)
+    """Further things, perhaps: those that a single photo shows, and small ones."""
     caution: str | None = None
     """Why the answer is doubtful; None if it isn't."""
+
+    @property
+    def sure(self) -> list[Thing]:
+        """Those of the things that three or more photos show, and half as many as show the typical one."""
+        often = max(VIEWS, float(np.median([thing.views for thing in self.things] or [0])) / 2)
+        return [thing for thing in self.things if thing.views > often]
+
+    @property
+    def least(self) -> int:
+        """Lowest number of things that is likely."""
+        return len(self.sure)
+
+    @property
+    def most(self) -> int:
+        """Highest number of things that is likely."""
+        return len(self.things) + len(self.candidates)
 
     @property
     def count(self) -> str:
@@ -47,7 +61,7 @@ class Things:
         return sure if self.least == self.most else f"{sure}, perhaps {self.least} to {self.most}"
 
 
-def things_of(scene: Scene, texts: str | Sequence[str]) -> list[Things]:
+def things_of(scene: Answering, texts: str | Sequence[str]) -> list[Things]:
     """Find the single things that each prompt of `texts` names.
 
     Every training view's heat map falls into pieces (`pieces_of`), and pieces of several views are one thing
@@ -59,7 +73,7 @@ def things_of(scene: Scene, texts: str | Sequence[str]) -> list[Things]:
     """
     question = scene.ask(texts)
     mass = scene.mass.double().cpu().numpy()
-    up = up_of(scene)
+    means, up = scene.splats.means.double().cpu().numpy(), up_of(scene)
     sharp = [_sharpened(scene, relevancy) for relevancy in question.relevancy]
     # A word whose peak stays below the lowest level names nothing here.
     present = (peaks(question.relevancy) > LEVELS[0]).tolist()
@@ -67,22 +81,28 @@ def things_of(scene: Scene, texts: str | Sequence[str]) -> list[Things]:
     for views in _views(scene, torch.stack(sharp, 1)):
         for found, shown, there in zip(pieces, views, present, strict=True):
             found += pieces_of(shown) if there else []
+
+    def box(one: Joined, weight: Float[Array, " n"]) -> Box:
+        return upright_box(means[one.rows], weight[one.rows], up)
+
     answers, known = list[Things](), _KNOWN.setdefault(scene, [])
     for i, prompt in enumerate(question.prompts):
-        weight = np.sqrt(mass) * question.relevancy[i].double().cpu().numpy()
-        candidates = join(pieces[i], weight)
-        joined = without_crumbs(candidates)
-        sure = [one for one in joined if one.views >= VIEWS]
-        things = [_thing(scene, prompt.text, one, mass, question.relevancy[i], up) for one in sure]
-        things = [_known(thing, known, mass) for thing in things]
+        values = question.relevancy[i].double().cpu().numpy()
+        weight = np.sqrt(mass) * values
+        parts = join(pieces[i], weight)
+        joined = stacked(parts, [box(part, weight) for part in parts])
+        sure = [one for one in without_crumbs(joined) if one.views >= VIEWS]
+        listed = [_thing(prompt.text, one, box(one, weight), mass, values)
+                  for one in [*sure, *(one for one in joined if one not in sure)]]  # fmt: skip
+        listed = [_known(thing, known, mass) for thing in listed]
+        things, candidates = listed[: len(sure)], listed[len(sure) :]
         known += [thing for thing in things if all(thing.id != other.id for other in known)]
-        least = sum(one.views > VIEWS for one in joined)
         caution = doubtful(prompt.text, question.doubts[i], prompt.taught is not None)
-        answers.append(Things(prompt.text, things, least, len(candidates), caution))
+        answers.append(Things(prompt.text, things, candidates, caution))
     return answers
 
 
-def up_of(scene: Scene) -> Float[Array, "3"]:
+def up_of(scene: Answering) -> Float[Array, "3"]:
     """Return the unit vector that points up: where photos tell it, theirs; otherwise the cameras' mean."""
     told = scene.file.georeference
     up = np.array([photo.camera_to_world for photo in scene.photos])[:, :, 1].mean(0)
@@ -90,7 +110,7 @@ def up_of(scene: Scene) -> Float[Array, "3"]:
     return up / max(np.linalg.norm(up), 1e-9)
 
 
-def _sharpened(scene: Scene, relevancy: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
+def _sharpened(scene: Answering, relevancy: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
     """Multiply relevancies by how much a Gaussian's color is that of the matches, and not of what is around
     them."""
     from scipy.spatial import KDTree
@@ -116,7 +136,7 @@ def _sharpened(scene: Scene, relevancy: Float[Tensor, " n"]) -> Float[Tensor, " 
 
 
 @torch.no_grad()
-def _views(scene: Scene, heat: Float[Tensor, "n q"]) -> Iterator[list[Shown]]:
+def _views(scene: Answering, heat: Float[Tensor, "n q"]) -> Iterator[list[Shown]]:
     """Render each training view's heat maps at the size that it was trained at."""
     means, splats = scene.splats.means, scene.splats
     for name, view in scene.visible.items():
@@ -125,7 +145,7 @@ def _views(scene: Scene, heat: Float[Tensor, "n q"]) -> Iterator[list[Shown]]:
         pose = camera.view_matrix.to(means)
         seen = means @ pose[:3, :3].T + pose[:3, 3]
         lit = torch.cat([heat.to(means), torch.ones_like(seen[:, 2:])], 1)
-        drawn = composite(splats, camera, torch.cat([lit, lit * seen[:, 2:]], 1), scene.backend)
+        drawn = composite(splats, camera, torch.cat([lit, lit * seen[:, 2:]], 1))
         maps, depths = np.split(np.moveaxis(drawn.cpu().numpy(), 2, 0), 2)
         inside = photo.foreground((camera.height, camera.width))
         keep = 1.0 if inside is None else inside.numpy()
@@ -142,18 +162,16 @@ def _views(scene: Scene, heat: Float[Tensor, "n q"]) -> Iterator[list[Shown]]:
 
 
 def _thing(
-    scene: Scene, word: str, one: Joined, mass: Float[Array, " n"], relevancy: Tensor, up: Float[Array, "3"]
+    word: str, one: Joined, box: Box, mass: Float[Array, " n"], relevancy: Float[Array, " n"]
 ) -> Thing:
-    rows, values = one.rows, relevancy.double().cpu().numpy()[one.rows]
-    weight = np.sqrt(mass[rows]) * values
-    center, axes, size = upright_box(scene.splats.means.double().cpu().numpy()[rows], weight, up)
+    rows = one.rows
     best: dict[str, Piece] = {}
     for piece in sorted(one.votes, key=lambda piece: (piece.cut, -piece.area)):
         best.setdefault(piece.photo, piece)
-    score = float(np.average(values, weights=np.maximum(mass[rows], 1e-9)))
+    score = float(np.average(relevancy[rows], weights=np.maximum(mass[rows], 1e-9)))
     sightings = [Sighting(name, piece.box) for name, piece in best.items()]
     number = int(rows[mass[rows].argmax()])
-    return Thing(number, word, score, one.views, center, axes, size, rows, sightings)
+    return Thing(number, word, score, one.views, *box, rows, sightings)
 
 
 def _known(thing: Thing, known: Sequence[Thing], mass: Float[Array, " n"]) -> Thing:

@@ -7,8 +7,9 @@ the question is about: of the photo that shows them best.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -19,13 +20,17 @@ from numpy import ndarray as Array
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import read_json
-from lang3dxl_ns.things.find import Things
+from lang3dxl_ns.query.scene import Scene
+from lang3dxl_ns.things.find import Things, up_of
 from lang3dxl_ns.things.thing import Thing
 
 BESIDE = 1.5
 """Distance, relative to the mean longest edge of two things, up to which they are next to each other."""
 INSIDE = 0.7
 """Half-size of a box, relative to its own edges, within which a center is in or on it."""
+
+CLOSE = 1.3
+"""Ratio of two sizes below which either may be the larger one."""
 
 
 @cache
@@ -65,6 +70,23 @@ class Sight:
     right: Float[Array, "3"]
     up: Float[Array, "3"]
     ahead: Float[Array, "3"]
+
+
+def sight_of(scene: Scene, things: list[Thing], photo: str | None = None) -> Sight:
+    """Return the directions of a photo's viewer; by default of the photo that shows most of the things."""
+    names = [sighting.photo for thing in things for sighting in thing.sightings]
+    if photo is None and names:
+        photo = max(sorted(set(names)), key=names.count)
+    shown = scene.overview if photo is None else scene.file.photo(photo)
+    up = up_of(scene)
+    ahead = -np.array(shown.camera_to_world)[:, 2]
+    ahead = ahead - up * (ahead @ up)
+    ahead /= max(np.linalg.norm(ahead), 1e-9)
+    return Sight(np.cross(ahead, up), up, ahead)
+
+
+Facing = Callable[[list[Thing]], Sight]
+"""Returns the directions in which some things are seen."""
 
 
 def parse(text: str) -> Request:
@@ -116,7 +138,7 @@ def _check_name(name: str) -> None:
         )
 
 
-def answer(request: Request, found: Iterable[Things], sight: Callable[[list[Thing]], Sight]) -> list[Thing]:
+def answer(request: Request, found: Sequence[Things], sight: Facing) -> list[Thing]:
     """Choose the things that a request asks for. `found` holds the things of `Request.words`; `sight` returns
     the directions in which some things are seen. Raises UserError if a thing that the relation refers to is
     not found, or if there are fewer things than the ordinal asks for."""
@@ -145,20 +167,51 @@ def answer(request: Request, found: Iterable[Things], sight: Callable[[list[Thin
     return chosen
 
 
-def unsure(request: Request, found: Iterable[Things]) -> str | None:
-    """Tell which numbers of things are unsure, so that the answer may be wrong; None if none is."""
-    wide = [one for one in found if one.word in request.words and one.least != one.most]
-    return ", ".join(f"{one.word}: {one.count}" for one in wide) or None
+def unsure(request: Request, found: Sequence[Things], sight: Callable[[list[Thing]], Sight]) -> str | None:
+    """Tell what may make an answer wrong; None if nothing does. Arguments are those of `answer`.
+
+    The answer has to be the same without the things that few photos show, and with all candidates. Sizes are
+    known roughly: where the next thing is nearly as large, either may be the largest.
+    """
+    wide = []
+    for one in found:
+        ways = (one.things, one.sure, [*one.things, *one.candidates])
+        told = {
+            _told(request, [replace(o, things=way) if o is one else o for o in found], sight) for way in ways
+        }
+        if one.word in request.words and len(told) > 1:
+            wide.append(f"{one.word}: {one.count}")
+    return ", ".join(wide) or _close(request, found, sight)
+
+
+def _told(request: Request, found: Sequence[Things], sight: Facing) -> int | frozenset[int] | None:
+    with suppress(UserError):
+        chosen = answer(request, found, sight)
+        return len(chosen) if request.count else frozenset(thing.id for thing in chosen)
+    return None
+
+
+def _close(request: Request, found: Sequence[Things], sight: Callable[[list[Thing]], Sight]) -> str | None:
+    kind, sign = table()["superlatives"].get(request.superlative, ("left", 1))
+    if kind in ("left", "top") or _told(request, found, sight) is None:
+        return None
+    listed = answer(replace(request, superlative=None), found, sight)
+    first = sorted((measure(thing, kind, sight(listed)) for thing in listed), key=lambda size: sign * size)[
+        :2
+    ]
+    close = len(first) == 2 and max(first) < CLOSE * min(first)
+    return f"another {request.word} measures nearly the same" if close else None
 
 
 def measure(thing: Thing, kind: str, view: Sight) -> float:
-    """Return what superlatives and ordinals compare (`kind`, of the table), in world units or, for a
-    volume, their cube."""
+    """Return what superlatives and ordinals compare (`kind`, of the table), in world units. How large a thing
+    is tells the area that one sees of it: its depth is the least sure."""
     if kind == "left":
         return float(thing.center @ view.right)
     if kind == "top":
         return float(thing.center @ view.up + thing.size[2] / 2)
-    return float({"tall": thing.size[2], "wide": thing.size[:2].max()}.get(kind, np.prod(thing.size)))
+    seen = np.sqrt(np.sort(thing.size)[1:].prod())
+    return float({"tall": thing.size[2], "wide": thing.size[:2].max()}.get(kind, seen))
 
 
 def _related(thing: Thing, relation: str, others: list[list[Thing]], view: Sight) -> bool:
@@ -173,12 +226,11 @@ def _related(thing: Thing, relation: str, others: list[list[Thing]], view: Sight
 def holds(thing: Thing, relation: str, other: Thing, view: Sight) -> bool:
     """Return whether a thing stands in a relation (a value of the table's `relations`) to another one."""
     apart = thing.center - other.center
-    if relation in ("left", "right"):
-        return bool((apart @ view.right) * (1 if relation == "right" else -1) > other.size[:2].max() / 2)
+    sides = {"left": -view.right, "right": view.right, "front": -view.ahead, "behind": view.ahead}
+    if relation in sides:
+        return bool(apart @ sides[relation] > other.size[:2].max() / 2)
     if relation in ("above", "below"):
         return bool((apart @ view.up) * (1 if relation == "above" else -1) > other.size[2] / 2)
-    if relation in ("front", "behind"):
-        return bool((apart @ view.ahead) * (1 if relation == "behind" else -1) > other.size[:2].max() / 2)
     if relation == "beside":
         return bool(np.linalg.norm(apart) < BESIDE * (thing.size.max() + other.size.max()) / 2)
     return bool((abs(other.axes @ apart) <= INSIDE * np.maximum(other.size, other.size.max() / 10)).all())

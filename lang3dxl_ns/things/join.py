@@ -13,6 +13,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from lang3dxl_ns.things.pieces import Piece
+from lang3dxl_ns.things.thing import Box
 
 SHARED = 0.35
 """Share of a piece's weight, or of a thing's, from which the two show the same."""
@@ -25,6 +26,10 @@ CRUMB = 0.03
 crumb of another, unless many views show it."""
 OFTEN = 8
 """Number of views that show a thing from which it is no crumb, however small: a pinnacle beside a spire."""
+SLIM = 4.0
+"""Height, relative to its width, from which a thing is one with what stands on or below it."""
+STRAIGHT = 1.5
+"""Distance of the two from one plumb line, relative to the slim one's width, up to which they are one."""
 MOST_SHARED = 0.5
 """Share of a piece's weight that may belong to known things if it is to be a new one."""
 
@@ -78,19 +83,30 @@ def join(pieces: Sequence[Piece], weight: Float[Array, " n"]) -> list[Joined]:
 
 def _united(things: Sequence[Joined], together: set[tuple[int, int]]) -> list[Joined]:
     photos = [{piece.photo for piece in thing.votes} for thing in things]
-    pairs = np.array([pair for pair in sorted(together) if not photos[pair[0]] & photos[pair[1]]])
-    ends = pairs.reshape(-1, 2).T.astype(int)
+    return _grouped(things, [(a, b) for a, b in sorted(together) if not photos[a] & photos[b]])
+
+
+def stacked(things: Sequence[Joined], boxes: Sequence[Box]) -> list[Joined]:
+    """Unite slim things with what stands on or below them: a minaret's shaft, its balcony and its tip.
+    `boxes` are the things' upright boxes."""
+    pairs = []
+    for a, (center, axes, size) in enumerate(boxes):
+        if size[2] < SLIM * size[:2].max():
+            continue
+        for b, (other, _, extent) in enumerate(boxes):
+            aside, high = np.linalg.norm(axes[:2] @ (other - center)), abs(axes[2] @ (other - center))
+            if a != b and aside < STRAIGHT * size[:2].max() and high < 1.5 * size[2] + extent[2] / 2:
+                pairs.append((a, b))
+    return _grouped(things, pairs)
+
+
+def _grouped(things: Sequence[Joined], pairs: Sequence[tuple[int, int]]) -> list[Joined]:
+    ends = np.array(pairs).reshape(-1, 2).T.astype(int)
     graph = coo_matrix((np.ones(ends.shape[1]), (ends[0], ends[1])), (len(things), len(things)))
     count, group = connected_components(graph, directed=False) if things else (0, np.zeros(0))
-    parts = [[things[i] for i in np.flatnonzero(group == number)] for number in range(count)]
-    return [
-        Joined(
-            np.concatenate([part.rows for part in of]),
-            sum(part.weight for part in of),
-            [piece for part in of for piece in part.votes],
-        )
-        for of in parts
-    ]
+    parts = ([things[i] for i in np.flatnonzero(group == number)] for number in range(count))
+    return [Joined(np.concatenate([one.rows for one in of]), sum(one.weight for one in of),
+                   [piece for one in of for piece in one.votes]) for of in parts]  # fmt: skip
 
 
 def without_crumbs(things: Sequence[Joined]) -> list[Joined]:

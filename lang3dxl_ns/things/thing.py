@@ -15,6 +15,10 @@ TURNS = 30
 """Number of directions that are tried for a box, over a quarter turn."""
 
 
+Box = tuple[Float[Array, "3"], Float[Array, "3 3"], Float[Array, "3"]]
+"""Center, axes and size of an upright box, as `Thing` has them."""
+
+
 @dataclass(frozen=True, eq=False)
 class Sighting:
     """Where a photo shows a thing."""
@@ -59,11 +63,8 @@ class Thing:
                 **numbers, "gaussians": len(self.rows), "photos": seen}  # fmt: skip
 
 
-def upright_box(
-    points: Float[Array, "m 3"], weight: Float[Array, " m"], up: Float[Array, "3"]
-) -> tuple[Float[Array, "3"], Float[Array, "3 3"], Float[Array, "3"]]:
-    """Find the upright box with the smallest base around weighted points; return center, axes and size, as
-    `Thing` has them. `up` is a unit vector."""
+def upright_box(points: Float[Array, "m 3"], weight: Float[Array, " m"], up: Float[Array, "3"]) -> Box:
+    """Find the upright box with the smallest base around weighted points. `up` is a unit vector."""
     aside = np.cross(up, np.eye(3)[abs(up).argmin()])
     aside /= np.linalg.norm(aside)
     ahead = np.cross(up, aside)

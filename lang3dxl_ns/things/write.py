@@ -14,12 +14,12 @@ import torch
 from PIL import Image, ImageDraw
 
 from lang3dxl_ns.common.files import make_folder, slugs, write_atomically
+from lang3dxl_ns.files.glb import encode_glb
 from lang3dxl_ns.files.splat_file import write_splats
 from lang3dxl_ns.query.heat_maps import PROMPT_COLORS
 from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.things.find import Things, up_of
-from lang3dxl_ns.things.grammar import Sight, holds
-from lang3dxl_ns.things.sight import sight_of
+from lang3dxl_ns.things.grammar import Sight, holds, sight_of
 from lang3dxl_ns.things.thing import Thing
 
 SIDES = {"left": "left_of", "right": "right_of", "above": "above", "below": "below"}
@@ -34,7 +34,9 @@ def write_catalog(scene: Scene, answers: Sequence[Things], folder: Path) -> None
     things = _each_once(answers)
     up = up_of(scene)
     graph = _relations(things, sight_of(scene, things))
-    words = [_summary(one) for one in answers]
+    words = [{"word": one.word, "count": len(one.things), "least": one.least, "most": one.most,
+              "caution": one.caution, "things": [thing.id for thing in one.things]}
+             for one in answers]  # fmt: skip
     content = {"words": words, "things": [t.as_json() for t in things], "relations": graph, "up": up.tolist()}
     write_atomically(folder / "things.json", json.dumps(content, indent=1) + "\n")
     rows = io.StringIO()
@@ -63,11 +65,6 @@ def _relations(things: Sequence[Thing], view: Sight) -> list[list[int | str]]:
     return graph
 
 
-def _summary(one: Things) -> dict[str, Any]:
-    numbers = {"count": len(one.things), "least": one.least, "most": one.most}
-    return {"word": one.word, **numbers, "caution": one.caution, "things": [thing.id for thing in one.things]}
-
-
 def coco(scene: Scene, answers: Sequence[Things]) -> dict[str, Any]:
     """Return the boxes of all things in all photos that show them, as COCO instances."""
     numbers = {photo.name: i + 1 for i, photo in enumerate(scene.photos)}
@@ -89,7 +86,7 @@ def coco(scene: Scene, answers: Sequence[Things]) -> dict[str, Any]:
 def write_picture(scene: Scene, answers: Sequence[Things], path: Path) -> None:
     """Draw numbered boxes on the rendering of the photo that shows most of the things."""
     shown = [
-        (i, n + 1, s) for i, one in enumerate(answers) for n, t in enumerate(one.things) for s in t.sightings
+        (i, n, s) for i, one in enumerate(answers) for n, t in enumerate(one.things, 1) for s in t.sightings
     ]
     if not shown:
         return
@@ -110,9 +107,11 @@ def write_picture(scene: Scene, answers: Sequence[Things], path: Path) -> None:
 
 
 def write_things(scene: Scene, answers: Sequence[Things], folder: Path, look: str | None = None) -> int:
-    """Write a splat file for each thing, named by word and id, and return how many were written."""
+    """Write a splat file for each thing, named by word and id, and scene.glb with the ids of all as features;
+    return how many things were written."""
     make_folder(folder)
     baked, things = scene.baked(look), _each_once(answers)
+    write_atomically(folder / "scene.glb", encode_glb(baked, things=things, place=scene.file.georeference))
     words = dict(zip((one.word for one in answers), slugs([one.word for one in answers]), strict=True))
     for thing in things:
         rows = torch.from_numpy(np.sort(thing.rows)).to(scene.device)
@@ -121,8 +120,5 @@ def write_things(scene: Scene, answers: Sequence[Things], folder: Path, look: st
 
 
 def _each_once(answers: Sequence[Things]) -> list[Thing]:
-    things: dict[int, Thing] = {}
-    for one in answers:
-        for thing in one.things:
-            things.setdefault(thing.id, thing)
-    return list(things.values())
+    every = [thing for one in answers for thing in one.things]
+    return [thing for i, thing in enumerate(every) if thing.id not in {other.id for other in every[:i]}]

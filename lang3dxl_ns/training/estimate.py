@@ -41,7 +41,7 @@ def estimate(run: Training, cameras: Sequence[PhotoCamera], steps: int) -> tuple
     for _ in range(5):
         start = perf_counter()
         look = None if looks is None else looks.of_view(camera)
-        render_in_look(splats, camera, look, background=run.means.new_zeros(3), backend=run.backend)
+        render_in_look(splats, camera, look, background=run.means.new_zeros(3))
         synchronize()
         times.append(perf_counter() - start)
     rendering, words = median(times), 0.0

@@ -61,6 +61,8 @@ class Settings:
     seed: int = 42
     save_every: int = 2_000
     """Iterations between two checkpoints, at most a quarter of the run."""
+    mixed_precision: bool = False
+    """Compute networks in bfloat16, on a GPU that multiplies it."""
     max_skipped_steps: int = 20
     """Most steps in a row without a finite loss or gradient before the run stops."""
 
@@ -116,10 +118,7 @@ class Run:
                 self.schedulers[name] = schedule.scheduler(optimizer)
         self.state.optimizers = self.optimizers
         self.guard = StepGuard(settings.max_skipped_steps, say)
-        pixels = max(camera.width * camera.height for camera in self.data.cameras)
-        most, message = plan(self.state, pixels, torch.device(device), settings.scene.max_gaussians)
-        self.state.densification.most = most
-        say(message)
+        say(plan(self.state, self.data.cameras))
         torch.manual_seed(settings.seed)
 
     @property
@@ -140,8 +139,9 @@ class Run:
         for optimizer in self.optimizers.values():
             optimizer.zero_grad()
         view, batch = data.next()
-        rendered = render(state, view)
-        found = losses(state, rendered.rgb, rendered.codes, batch)
+        with torch.autocast("cuda", torch.bfloat16, self.settings.mixed_precision):
+            rendered = render(state, view)
+            found = losses(state, rendered.rgb, rendered.codes, batch)
         functools.reduce(torch.add, found.values()).backward()
         groups = {n: [p for g in o.param_groups for p in g["params"]] for n, o in self.optimizers.items()}
         state.step_is_sound = self.guard.allows(step, data.photo_in_hand, found, groups)
@@ -261,6 +261,8 @@ def begin(capture: Capture, settings: Settings, out: Path, cache_dir: Path, devi
     settings.resolve()
     device = device or best_device()
     check_device(device, settings.scene.rasterizer, settings.steps)
+    if settings.mixed_precision and not (device.startswith("cuda") and torch.cuda.is_bf16_supported(False)):
+        raise UserError("--mixed-precision needs a GPU that multiplies bfloat16 (since Ampere): leave it off")
     out.mkdir(parents=True, exist_ok=True)
     torch.manual_seed(settings.seed)
     run = Run(capture, settings, out, cache_dir, device)

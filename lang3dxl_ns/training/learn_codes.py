@@ -71,7 +71,7 @@ def _target_view(run: Training, view: PhotoCamera, batch: Batch) -> TargetView:
     camera = resized(view.camera(run.pose(view)).detach(), LONGER_SIDE)
     splats, size = run.splats(), (camera.height, camera.width)
     return TargetView(
-        partial(composite, splats, camera, backend=run.backend),
+        partial(composite, splats, camera),
         size,
         batch["clip_target"],
         batch.get("dense_target"),

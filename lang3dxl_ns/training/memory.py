@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import torch
 
 from lang3dxl_ns.common.kernels import MOST_SUMS
 from lang3dxl_ns.common.memory import machine_memory
 from lang3dxl_ns.common.options import model_option
-from lang3dxl_ns.training.state import Training
+from lang3dxl_ns.training.state import PhotoCamera, Training
 
 PER_PARAMETER = 16.0
 """Bytes per parameter for its value, its gradient, and Adam's two moments."""
@@ -60,14 +62,16 @@ def memory_to_plan_with(device: torch.device) -> float:
     return MAIN_SHARE * machine_memory()
 
 
-def plan(run: Training, pixels: int, device: torch.device, wanted: int | None) -> tuple[int, str]:
-    """Return the cap on Gaussians (0: none) for the setting `max_gaussians`, and a line for the log."""
-    memory, now = memory_to_plan_with(device), len(run.gaussians["means"])
-    fixed, each = bytes_of(run, pixels)
+def plan(run: Training, cameras: Iterable[PhotoCamera]) -> str:
+    """Cap the run's Gaussians by its settings or, for photos of these cameras, by memory; return a line for
+    the log."""
+    memory, now, wanted = memory_to_plan_with(run.device), len(run.means), run.settings.max_gaussians
+    fixed, each = bytes_of(run, max(camera.width * camera.height for camera in cameras))
     most = max(int((memory - fixed) / each), now) if wanted is None else wanted
+    run.densification.most = most
     limit = f"at most {most:,} Gaussians" if most else "no limit to their number"
-    where = "the GPU" if device.type == "cuda" else "training"
-    return most, (
+    where = "the GPU" if run.device.type == "cuda" else "training"
+    return (
         f"memory of {where}: about {(fixed + now * each) / 1e9:.1f} GB with the first {now:,} Gaussians, "
         f"{each * 1e6 / 1e9:.1f} GB per million more; {memory / 1e9:.1f} GB to plan with, "
         f"{limit} (max-gaussians)"

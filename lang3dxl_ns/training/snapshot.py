@@ -44,7 +44,6 @@ def snapshot(
         config=config or QueryConfig(),
         encode_texts=encode_texts,
         cache=cache,
-        backend=run.backend,
         watch=watch,
     )
 

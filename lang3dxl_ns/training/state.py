@@ -173,7 +173,7 @@ class Training:
         else:
             harmonics = of_training.harmonics(g)[:, : (self.degree + 1) ** 2]
         gaussians = vars(of_training.activated(g))
-        return Splats(**gaussians, harmonics=harmonics, antialiased=self.antialiased)
+        return Splats(**gaussians, harmonics=harmonics, antialiased=self.antialiased, backend=self.backend)
 
     def to(self, device: torch.device | str) -> None:
         """Move Gaussians and parts to a device, in place."""

@@ -1,7 +1,7 @@
 // Questions about things: counts, superlatives, ordinals and relations, as in Python's things/grammar.py.
 import language from "./language.js";
 
-const { grammar } = language, { BESIDE, INSIDE } = language.things;
+const { grammar } = language, { BESIDE, INSIDE, CLOSE, VIEWS } = language.things;
 const has = (table, word) => Object.hasOwn(table, word);
 const any = (phrases) => [...(Array.isArray(phrases) ? phrases : Object.keys(phrases))].sort((a, b) => b.length - a.length).join("|");
 const plain = (text) => text.trim().replace(new RegExp(`^(?:(?:${any(grammar.articles)})\\s+)+`), "");
@@ -74,13 +74,50 @@ export function answerTo(request, things, view) {
   return ordered(grammar.from[along]).slice(nth - 1, nth);
 }
 
+/** Those of the things that three or more photos show, and half as many as show the typical one. */
+export function sureOf(things) {
+  const seen = things.map(({ views }) => views).sort((a, b) => a - b), half = seen.length >> 1;
+  const typical = seen.length ? (seen[half] + seen[seen.length - 1 - half]) / 2 : 0;
+  return things.filter(({ views }) => views > Math.max(VIEWS, typical / 2));
+}
+
+/** How many there are, such as "34, perhaps 31 to 37". after: a text behind the number. */
+export function count({ things, candidates }, after = "") {
+  const least = sureOf(things).length, most = things.length + candidates.length;
+  return things.length + after + (least === most ? "" : `, perhaps ${least} to ${most}`);
+}
+
+/** Tell what may make an answer wrong, or null. found: { things, candidates } of each word; shown: writes a word. */
+export function unsure(request, found, view, shown = (word) => word) {
+  const of = (changed) => Object.fromEntries(Object.entries(found).map(([word, one]) => [word, changed[word] ?? one.things]));
+  const told = (changed) => {
+    try {
+      const chosen = answerTo(request, of(changed), view);
+      return request.count ? chosen.length : chosen.map(({ id }) => id).sort((a, b) => a - b).join();
+    } catch {
+      return null;
+    }
+  };
+  const wide = wordsOf(request).filter((word) => {
+    const { things, candidates } = found[word];
+    return new Set([things, sureOf(things), [...things, ...candidates]].map((some) => told({ [word]: some }))).size > 1;
+  });
+  if (wide.length) return wide.map((word) => `${shown(word)}: ${count(found[word])}`).join(", ");
+  const [kind, sign] = grammar.superlatives[request.superlative] ?? ["left", 1];
+  if (kind === "left" || kind === "top" || told({}) === null) return null;
+  const sizes = answerTo({ ...request, superlative: null }, of({}), view).map((thing) => measure(thing, kind, view)).sort((a, b) => sign * (a - b));
+  const close = sizes.length > 1 && Math.max(sizes[0], sizes[1]) < CLOSE * Math.min(sizes[0], sizes[1]);
+  return close ? `another ${shown(request.word)} measures nearly the same` : null;
+}
+
 const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 const minus = (a, b) => a.map((value, axis) => value - b[axis]);
 
 function measure({ center, size }, kind, view) {
   if (kind === "left") return dot(center, view.right);
   if (kind === "top") return dot(center, view.up) + size[2] / 2;
-  return { tall: size[2], wide: Math.max(size[0], size[1]) }[kind] ?? size[0] * size[1] * size[2];
+  const [, a, b] = [...size].sort((x, y) => x - y);
+  return { tall: size[2], wide: Math.max(size[0], size[1]) }[kind] ?? Math.sqrt(a * b);
 }
 
 function related(thing, relation, others, view) {

@@ -1,14 +1,12 @@
 // The list of a word's things: how many were found, one after the other, their boxes, and questions about them.
 import { element, shown } from "./cards.js";
-import { answerTo, parse, wordsOf } from "./grammar.js";
+import { answerTo, count, parse, unsure, wordsOf } from "./grammar.js";
 import { Vector3 } from "./library.js";
 import { lengthAsText } from "./measure.js";
 
 const NAMESPACE = "http://www.w3.org/2000/svg", CORNERS = [0, 1, 2, 3, 4, 5, 6, 7];
 const FILLED = 0.35, NARROW = 15, WIDE = 60; // share of the window that a thing fills after a flight; degrees of the lens
 const GAP = 4, LETTER = 8, LINE = 18; // pixels between labels, per letter, and of a line
-
-const count = ({ things, least, most }, found = "") => things.length + found + (least === most ? "" : `, perhaps ${Math.min(least, things.length)} to ${Math.max(most, things.length)}`);
 
 export class List extends EventTarget {
   /** about: the page's description; think: gives the worker a job; view, prompts: what is shown. Fires `change` when
@@ -18,7 +16,7 @@ export class List extends EventTarget {
     Object.assign(this, { about, think, view, prompts, chosen: null, alone: false, wanted: null });
   }
 
-  /** Find a prompt's things, once for each of its answers; resolves to { things, least, most }. */
+  /** Find a prompt's things, once for each of its answers; resolves to { things, candidates }. */
   async find(prompt) {
     const { turn, relevancy } = prompt;
     if (prompt.counting?.turn !== turn) prompt.counting = { turn, found: this.think("things", { relevancy }) };
@@ -144,16 +142,17 @@ export class List extends EventTarget {
   /** Answer a question, such as "highest tower". ask: answers a prompt, and resolves to whether its words are known.
    * Resolves to the answer in words; null if some word is unknown. */
   async question(typed, ask) {
-    const request = parse(typed), words = wordsOf(request), things = {};
+    const request = parse(typed), words = wordsOf(request), found = {};
     for (const word of words) if (!(await ask(word))) return null;
     const asked = words.map((word) => this.prompts.find(({ text }) => text === word));
     if (!asked.every(Boolean)) return null;
-    for (const prompt of asked) things[prompt.text] = (await this.find(prompt)).things;
-    const chosen = answerTo(request, things, this.directions), [first] = asked, every = chosen.length === things[request.word].length;
+    for (const prompt of asked) found[prompt.text] = await this.find(prompt);
+    const things = Object.fromEntries(Object.entries(found).map(([word, one]) => [word, one.things]));
+    const view = this.directions, chosen = answerTo(request, things, view), [first] = asked, every = chosen.length === things[request.word].length;
     Object.assign(first, { listed: true, asked: every ? null : new Set(chosen.map(({ id }) => id)) });
     const sure = asked.every(({ trust }) => trust.level === "sure") ? "" : " Not sure: see the cards.";
-    const wide = request.count && every ? [] : asked.filter(({ found }) => found.least !== found.most); // as Python's unsure
-    const note = (wide.length ? ` Unsure, since ${wide.map(({ text, found }) => `${shown(text)}: ${count(found)}`).join(", ")}.` : "") + sure;
+    const doubt = request.count && every ? null : unsure(request, found, view, shown);
+    const note = (doubt ? ` Unsure, since ${doubt}.` : "") + sure;
     if (request.count) {
       this.dispatchEvent(new Event("change"));
       return `${every ? count(first.found) : chosen.length} ${shown(request.word)}.${note}`;

@@ -3,21 +3,22 @@
 import language from "./language.js";
 import { fitted } from "./like.js";
 
-const { LEVELS, PART, DEPTH, FILLED, SHARED, SPLINTER, VIEWS, CRUMB, OFTEN, MOST_SHARED, OUTLIERS, TURNS, COLORED, SAME } = language.things;
+const { LEVELS, PART, DEPTH, FILLED, SHARED, SPLINTER, VIEWS, CRUMB, OFTEN, MOST_SHARED, OUTLIERS, TURNS, COLORED, SAME, SLIM, STRAIGHT } = language.things;
 const SIDE = 240, LEAST = 3; // pixels of a view's longer side, and of the smallest piece
 const FAINT = 0.05, TRACE = 0.004, REACH = 2.5, BLUR = 0.3; // relevancy and heat that leave no trace, standard deviations that are drawn, square pixels
 const RIDGE = 0.1, ROUNDS = 12; // strength of the colors' regularization, Newton steps
 const DC = 0.28209479177387814; // of spherical harmonics: colors are compared as coefficients
 
-/** Find the things of a word: { things, least, most }, largest first. views: as of find.js; scene: { centers, axes,
+/** Find the things of a word: { things, candidates }, each largest first. views: as of find.js; scene: { centers, axes,
  * bytes (packed splats), mass, gap, up }, in one frame. */
 export function thingsOf(views, scene, relevancy) {
   const heat = sharpened(scene, relevancy), { mass } = scene;
   const weight = Float64Array.from(relevancy, (value, i) => Math.sqrt(mass[i]) * value);
-  const candidates = join(views.flatMap((view, v) => piecesOf(drawn(view, scene, heat), v)), weight);
-  const joined = withoutCrumbs(candidates), sure = joined.filter((one) => photosOf(one).size >= VIEWS);
-  const things = sure.map((one) => described(one, scene, weight, relevancy)).sort((a, b) => b.weight - a.weight);
-  return { things, least: joined.filter((one) => photosOf(one).size > VIEWS).length, most: candidates.length };
+  const parts = join(views.flatMap((view, v) => piecesOf(drawn(view, scene, heat), v)), weight);
+  const joined = stacked(parts, parts.map(({ rows }) => uprightBox(rows, scene.centers, weight, scene.up)));
+  const sure = new Set(withoutCrumbs(joined).filter((one) => photosOf(one).size >= VIEWS));
+  const listed = (some) => some.map((one) => described(one, scene, weight, relevancy)).sort((a, b) => b.weight - a.weight);
+  return { things: listed([...sure]), candidates: listed(joined.filter((one) => !sure.has(one))) };
 }
 
 /** Return whether a word's peak reaches the lowest level: one that stays below names nothing here. */
@@ -55,7 +56,7 @@ function described({ rows, weight, votes }, { centers, mass, up }, weights, rele
   const best = new Map();
   for (const piece of [...votes].sort((a, b) => a.cut - b.cut || b.area - a.area)) if (!best.has(piece.view)) best.set(piece.view, piece.box);
   const seen = [...best].map(([view, box]) => ({ view, box }));
-  return { id, weight, score: sum / heavy, rows: Uint32Array.from(rows).sort(), seen, ...uprightBox(rows, centers, weights, up) };
+  return { id, weight, views: seen.length, score: sum / heavy, rows: Uint32Array.from(rows).sort(), seen, ...uprightBox(rows, centers, weights, up) };
 }
 
 // ── heat ──
@@ -225,9 +226,27 @@ export function join(pieces, weight) {
 
 /** Unite the things that some piece covers together, and no photo shows apart. */
 function united(things, together) {
-  const photos = things.map(photosOf), parent = things.map((_, t) => t), root = (t) => (parent[t] === t ? t : (parent[t] = root(parent[t])));
-  for (const [a, b] of together) {
-    if ([...photos[a]].some((photo) => photos[b].has(photo))) continue;
+  const photos = things.map(photosOf);
+  return grouped(things, together.filter(([a, b]) => ![...photos[a]].some((photo) => photos[b].has(photo))));
+}
+
+/** Unite slim things with what stands on or below them. boxes: the things' upright boxes. */
+export function stacked(things, boxes) {
+  const pairs = [];
+  boxes.forEach(({ center, axes, size }, a) => {
+    const wide = Math.max(size[0], size[1]);
+    if (size[2] < SLIM * wide) return;
+    boxes.forEach((other, b) => {
+      const [x, y, high] = axes.map((axis) => axis.reduce((sum, value, k) => sum + value * (other.center[k] - center[k]), 0));
+      if (a !== b && Math.hypot(x, y) < STRAIGHT * wide && Math.abs(high) < 1.5 * size[2] + other.size[2] / 2) pairs.push([a, b]);
+    });
+  });
+  return grouped(things, pairs);
+}
+
+function grouped(things, pairs) {
+  const parent = things.map((_, t) => t), root = (t) => (parent[t] === t ? t : (parent[t] = root(parent[t])));
+  for (const [a, b] of pairs) {
     const [low, high] = [root(a), root(b)].sort((x, y) => x - y);
     parent[high] = low;
   }

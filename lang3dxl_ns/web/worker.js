@@ -146,12 +146,12 @@ const jobs = {
     };
   },
 
-  /** Find the single things of an answer: { things, least, most }. */
+  /** Find the single things of an answer: { things, candidates }. */
   things({ relevancy }) {
-    if (!isPresent(relevancy, about.words.rules)) return { things: [], least: 0, most: 0 };
+    if (!isPresent(relevancy, about.words.rules)) return { things: [], candidates: [] };
     const found = thingsOf(views, { ...geometry, mass, gap: about.words.gap, up: about.up }, relevancy);
-    const things = found.things.map((thing) => ({ ...thing, id: known.id(thing), center: thing.center.map((value, axis) => value + about.center[axis]) }));
-    return { ...found, things };
+    const placed = (thing) => ({ ...thing, center: thing.center.map((value, axis) => value + about.center[axis]) });
+    return { things: found.things.map((thing) => placed({ ...thing, id: known.id(thing) })), candidates: found.candidates.map(placed) };
   },
 
   /** Find the words that match a pixel best, and its Gaussians; none where too few of them have a meaning. */

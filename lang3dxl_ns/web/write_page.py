@@ -23,13 +23,12 @@ from lang3dxl_ns.common.files import make_folder, replace_file
 from lang3dxl_ns.common.pictures import PHOTO_SUFFIXES
 from lang3dxl_ns.files.scene_file import Provenance
 from lang3dxl_ns.query import view_ranking
-from lang3dxl_ns.query.doubt import BEST, DOUBTFUL, DOUBTFUL_TAUGHT, LEAST_PEAK
+from lang3dxl_ns.query.doubt import BEST, DOUBTFUL, DOUBTFUL_TAUGHT, EVEN, LEAST_PEAK, SHARE
 from lang3dxl_ns.query.heat_maps import PROMPT_COLORS
 from lang3dxl_ns.query.language import TABLE, phrases_of
 from lang3dxl_ns.query.negatives import CLEAR, NOTHING, competitors
 from lang3dxl_ns.query.scene import NO_SEMANTICS, Scene
 from lang3dxl_ns.query.text import Prompt, tidy
-from lang3dxl_ns.query.thresholds import EVEN, SHARE
 from lang3dxl_ns.query.trust import ALIKE, ANCHORS, CLEARLY, FAINT, FAR, STRICTER, STRICTEST
 from lang3dxl_ns.query.visibility import spread
 from lang3dxl_ns.query.vocabulary import closest_word, common_words, same_thing, shipped_vocabulary
@@ -73,10 +72,10 @@ _SUGGESTED = (
 _RANKING = ("PEAK", "LARGE", "RIM", "STRONG", "CORE", "JOINED", "OUTLIERS", "DENSE")
 _THINGS = (
     (pieces, "LEVELS PART DEPTH FILLED"),
-    (join, "SHARED SPLINTER VIEWS CRUMB OFTEN MOST_SHARED"),
+    (join, "SHARED SPLINTER VIEWS CRUMB OFTEN MOST_SHARED SLIM STRAIGHT"),
     (thing, "OUTLIERS TURNS"),
     (find, "COLORED SAME"),
-    (grammar, "BESIDE INSIDE"),
+    (grammar, "BESIDE INSIDE CLOSE"),
 )
 """Numbers that tell things apart and relate them, by the modules that hold them."""
 _TEXTS = 256

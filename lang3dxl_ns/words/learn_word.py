@@ -23,7 +23,7 @@ from torch import Tensor
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.query.engine import QueryEngine
 from lang3dxl_ns.query.relevancy import Queries
-from lang3dxl_ns.rendering import Backend, Splats, composite
+from lang3dxl_ns.rendering import Splats, composite
 from lang3dxl_ns.rendering.gathering import filled_parts
 from lang3dxl_ns.scene.camera import resized
 from lang3dxl_ns.scene.record import ScenePhoto
@@ -60,14 +60,14 @@ class Weights:
     seen: Float[Tensor, " n"]
 
     @classmethod
-    def of(cls, example: Example, photo: ScenePhoto, splats: Splats, backend: Backend = "auto") -> Weights:
+    def of(cls, example: Example, photo: ScenePhoto, splats: Splats) -> Weights:
         """Measure what an example marks in its photo's foreground. Raises UserError for marks outside it."""
         camera = resized(photo.full_camera, MARK_SIDE)
         size = (camera.height, camera.width)
         foreground = photo.foreground(size)
         shown = torch.ones(size) if foreground is None else foreground.float()
         pixels = torch.cat([_marks(example, photo, size) * shown, shown[None]]).permute(1, 2, 0)
-        drawn = partial(composite, splats, camera, backend=backend)
+        drawn = partial(composite, splats, camera)
         parts = filled_parts(drawn, pixels.to(splats.means.device), len(splats))
         return cls(*parts.unbind(1))
 

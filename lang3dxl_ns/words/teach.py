@@ -30,7 +30,7 @@ def learned_word(
     # A command that is repeated, such as one that was killed, teaches nothing twice.
     pairs = {str(example.to_json()): (example, photo) for example, photo in zip(listed, photos, strict=True)}
     listed = [example for example, _ in pairs.values()]
-    weights = [Weights.of(example, photo, scene.splats, scene.backend) for example, photo in pairs.values()]
+    weights = [Weights.of(example, photo, scene.splats) for example, photo in pairs.values()]
     if selection is not None:
         selection = torch.as_tensor(selection, device=scene.device)
         weights = [Weights(w.seen * selection, torch.zeros_like(w.seen), w.seen) for w in weights]

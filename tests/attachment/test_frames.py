@@ -135,7 +135,7 @@ def test_a_transforms_json_is_read_like_the_colmap_model(collection, tmp_path):
 
 def test_few_photos_must_agree_better_than_many():
     def fit(score: float, photos: int) -> Fit:
-        return Fit("a frame", np.eye(4), score, (1.0,) * photos)
+        return Fit("a frame", np.eye(4), score, photos)
 
     assert fit(0.55, 12).fits and not fit(0.55, 3).fits and fit(0.7, 3).fits and not fit(0.45, 12).fits
 

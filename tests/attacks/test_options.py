@@ -8,9 +8,10 @@ from pathlib import Path
 import pytest
 import torch
 
+from lab.run_config import run_config
 from lang3dxl_ns.cli import main
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.methods import METHODS, lang3dxl, run_config
+from lang3dxl_ns.methods import METHODS, lang3dxl
 from lang3dxl_ns.plugin.trainer import requested_checkpoint
 from lang3dxl_ns.preparation.settings import PreparationConfig
 from lang3dxl_ns.query.question import QueryConfig

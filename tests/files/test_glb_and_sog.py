@@ -1,7 +1,10 @@
-"""GLB and SOG: what is written is read back, as the formats say, and a GLB carries words."""
+"""GLB, SOG and SPZ: what is written is read back, as the formats say, and a GLB or SPZ carries words."""
 
+import gzip
 import io
+import itertools
 import json
+import re
 import struct
 import zipfile
 
@@ -14,10 +17,14 @@ from PIL import Image
 from test_scene_file import decoded
 
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.files import spz
+from lang3dxl_ns.files.glb import encode_glb
 from lang3dxl_ns.files.read_splats import read_splats
 from lang3dxl_ns.files.scene_file import keep_words, read_scene, write_scene
 from lang3dxl_ns.files.splat_file import write_splats
 from lang3dxl_ns.rendering import Splats
+from lang3dxl_ns.scene.georeference import Georeference
+from lang3dxl_ns.things.thing import Thing
 
 
 def some_splats(count: int = 200, bands: int = 4, antialiased: bool = True) -> Splats:
@@ -67,18 +74,147 @@ def test_a_glb_has_the_attributes_of_the_extension(tmp_path):
         np.testing.assert_allclose(values, wanted.flatten(), atol=1e-6)
 
 
-def test_a_glb_of_a_scene_answers_as_the_scene_does(tmp_path):
+def thing(number: int, word: str, rows: list[int], size: float) -> Thing:
+    box = np.array([1.0, 2, 3]), np.eye(3), np.full(3, size)
+    return Thing(number, word, 0.75, 3, *box, np.array(rows))
+
+
+PLACE = Georeference(2.5, (0.0, 0.0, 1.0), (0.0, 1.0, 0.0), 0.05, 7)
+
+
+def test_things_are_features_with_a_table_of_labels(tmp_path):
+    splats = some_splats(6, bands=1)
+    splats.means[1] = torch.nan  # is left out, and the ids follow
+    small, large = thing(4, "Rose-Fenster ü", [4, 5], 1.0), thing(0, "tower", [0, 1, 2, 4], 9.0)
+    inner = thing(2, "tower", [2], 1.0)
+    codes = torch.rand(6, 3)
+    (tmp_path / "a.glb").write_bytes(
+        encode_glb(splats, codes=codes, things=[inner, small, large], place=PLACE)
+    )
+    about, binary = described(tmp_path / "a.glb")
+    assert_valid(about, binary)
+
+    def viewed(number: int, kind: str) -> np.ndarray:
+        view = about["bufferViews"][number]
+        return np.frombuffer(binary[view["byteOffset"] :][: view["byteLength"]], kind)
+
+    primitive = about["meshes"][0]["primitives"][0]
+    values = {
+        name: viewed(about["accessors"][number]["bufferView"], "<f4")
+        for name, number in primitive["attributes"].items()
+    }
+    np.testing.assert_array_equal(values["_CODE"].reshape(-1, 3), codes[[0, 2, 3, 4, 5]].numpy())
+    sets = primitive["extensions"]["EXT_mesh_features"]["featureIds"]
+    # Rows are those of the table; a small thing is seen before a large one that it is part of; 3 is none.
+    ids = [values[f"_FEATURE_ID_{one['attribute']}"].tolist() for one in sets]
+    assert ids == [[2, 0, 3, 2, 3], [3, 3, 3, 1, 1]]
+    assert [one["featureCount"] for one in sets] == [2, 1] and {one["nullFeatureId"] for one in sets} == {3}
+    assert all(re.fullmatch(r"[a-zA-Z_][a-zA-Z0-9_]*", one["label"]) for one in sets)
+    table = about["extensions"]["EXT_structural_metadata"]["propertyTables"][0]
+    columns = table["properties"]
+    ends = viewed(columns["word"]["stringOffsets"], "<u4")
+    text = viewed(columns["word"]["values"], "u1").tobytes()
+    words = [text[a:b].decode() for a, b in itertools.pairwise(ends)]
+    assert words == ["tower", "Rose-Fenster ü", "tower"] and table["count"] == 3
+    assert viewed(columns["id"]["values"], "<u4").tolist() == [2, 4, 0]
+    assert viewed(columns["size"]["values"], "<f4").reshape(3, 3)[:, 0].tolist() == [1, 1, 9]
+    assert len(read_splats(tmp_path / "a.glb")) == 5
+
+
+def test_a_glb_stands_upright_in_meters(tmp_path):
+    """Up is glTF's y, north its -z, and another program reads the node so."""
+    trimesh = pytest.importorskip("trimesh")
+    splats = some_splats(5, bands=1)
+    write_splats(tmp_path / "a.glb", splats, place=PLACE)
+    cloud = trimesh.load(tmp_path / "a.glb").to_geometry()
+    east, north, up = (splats.means * 2.5).T.numpy()
+    np.testing.assert_allclose(cloud.vertices, np.stack([east, up, -north], 1), atol=1e-5)
+    torch.testing.assert_close(read_splats(tmp_path / "a.glb").means, splats.means)  # in its own frame
+    write_splats(tmp_path / "a.ply", splats, place=PLACE)
+    assert b"\ncomment 1 unit is 2.5 m \xc2\xb1 5%, by the GPS" in (tmp_path / "a.ply").read_bytes()
+    torch.testing.assert_close(read_splats(tmp_path / "a.ply").means, splats.means)
+
+
+def assert_valid(about: dict, binary: bytes) -> None:
+    """Rules of glTF 2.0 and of the two extensions' schemas."""
+    assert about["asset"]["version"] == "2.0" and about["buffers"] == [{"byteLength": len(binary)}]
+    used = set(about["extensionsUsed"])
+    (primitive,) = about["meshes"][0]["primitives"]
+    assert used == {*primitive["extensions"], *about.get("extensions", {})}
+    end = 0
+    for view in about["bufferViews"]:
+        assert view["buffer"] == 0 and view["byteLength"] > 0 and view["byteOffset"] >= end
+        assert view["byteOffset"] % 8 == 0  # what EXT_structural_metadata demands
+        end = view["byteOffset"] + view["byteLength"]
+    assert end <= len(binary) < end + 4
+    counts = set()
+    for name, number in primitive["attributes"].items():
+        accessor = about["accessors"][number]
+        sides = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}[accessor["type"]]
+        view = about["bufferViews"][accessor["bufferView"]]
+        assert view["target"] == 34962 and view["byteLength"] == 4 * sides * accessor["count"]
+        values = np.frombuffer(binary, "<f4", sides * accessor["count"], view["byteOffset"])
+        assert np.isfinite(values).all()
+        values = values.reshape(-1, sides)
+        assert accessor["min"] == values.min(0).tolist() and accessor["max"] == values.max(0).tolist()
+        assert name == "POSITION" or name.startswith(("_", "KHR_gaussian_splatting:"))
+        counts.add(accessor["count"])
+    assert len(counts) == 1
+    tables = about.get("extensions", {}).get("EXT_structural_metadata", {"propertyTables": []})
+    for one in primitive["extensions"].get("EXT_mesh_features", {"featureIds": []})["featureIds"]:
+        assert one["featureCount"] >= 1 and one["propertyTable"] < len(tables["propertyTables"])
+    for table in tables["propertyTables"]:
+        known = tables["schema"]["classes"][table["class"]]["properties"]
+        assert known.keys() == table["properties"].keys() and table["count"] >= 1
+
+
+@pytest.mark.parametrize("ending", ["glb", "spz"])
+def test_a_splat_that_carries_a_scene_answers_as_the_scene_does(ending, tmp_path):
     scene = painted_scene(**decoded("gathered"))
-    for name in ("a.scene", "a.glb"):
+    names = "a.scene", f"a.{ending}"
+    for name in names:
         write_scene(tmp_path / name, scene)
-    ours, other = (read_scene(tmp_path / name, encode_texts=encode_texts) for name in ("a.scene", "a.glb"))
+    ours, other = (read_scene(tmp_path / name, encode_texts=encode_texts) for name in names)
     np.testing.assert_array_equal(ours.relevancy("dome"), other.relevancy("dome"))
-    assert len(read_splats(tmp_path / "a.glb")) == len(scene.splats)
+    assert len(read_splats(tmp_path / names[1])) == len(scene.splats)
+    if ending == "glb":
+        assert_valid(*described(tmp_path / names[1]))
     with pytest.raises(UserError, match=r"--scene-file NAME.scene"):
-        keep_words(tmp_path / "a.glb", {})
-    write_splats(tmp_path / "b.glb", scene.splats)
+        keep_words(tmp_path / names[1], {})
+    write_splats(tmp_path / f"b.{ending}", scene.splats)
     with pytest.raises(UserError, match="without words"):
-        read_scene(tmp_path / "b.glb")
+        read_scene(tmp_path / f"b.{ending}")
+
+
+def test_an_spz_with_a_scene_is_an_spz_for_others_and_of_any_version_for_us(tmp_path):
+    gsply = pytest.importorskip("gsply")
+    scene = painted_scene(**decoded("gathered"))
+    path, plain = tmp_path / "a.spz", tmp_path / "b.spz"
+    write_scene(path, scene)
+    write_splats(plain, scene.baked())
+    np.testing.assert_array_equal(gsply.read_spz(path).means, gsply.read_spz(plain).means)
+    record = spz.scene_record(path)
+    gsply.write_spz(plain, gsply.read_spz(path), version=4)
+    content = bytearray(plain.read_bytes())
+    records = struct.pack("<III", 0xADBE0002, 4, 0) + struct.pack("<II", 0x4C330001, len(record)) + record
+    content[14] |= 2  # flags
+    content[16:20] = struct.pack("<I", 32 + len(records))
+    path.write_bytes(bytes(content[:32]) + records + bytes(content[32:]))
+    assert spz.scene_record(path) == record
+    torch.testing.assert_close(read_splats(path).means, read_splats(plain).means)
+    content[16:20] = struct.pack("<I", 32 + 12)
+    path.write_bytes(bytes(content[:32]) + records[:12] + bytes(content[32:]))
+    assert spz.scene_record(path) is None
+
+
+def test_a_small_spz_cannot_unpack_to_a_large_scene(tmp_path):
+    write_splats(tmp_path / "a.spz", some_splats(2))
+    content = bytearray(gzip.decompress((tmp_path / "a.spz").read_bytes()))
+    content[14] |= 2
+    bomb = bytes(content) + struct.pack("<II", 0x4C330001, 30_000_000) + bytes(30_000_000)
+    (tmp_path / "b.spz").write_bytes(gzip.compress(bomb))
+    with pytest.raises(UserError, match="unpacks to more"):
+        read_scene(tmp_path / "b.spz")
 
 
 def test_a_sog_is_read_back(tmp_path):

@@ -86,7 +86,7 @@ def test_first_iteration_moves_gaussians_as_without_appearance(train, scene):
 
 
 def test_a_look_changes_colors_and_nothing_else(train, scene):
-    trainer = train(scene, iterations=8, **{SHIFT: True})
+    trainer = train(scene, iterations=2, semantics=False, **{SHIFT: True})
     model, camera = trainer.pipeline.model, eval_camera(trainer)
     with torch.no_grad():
         model.appearance.output.bias.uniform_(-2, 2)
@@ -99,7 +99,7 @@ def test_a_look_changes_colors_and_nothing_else(train, scene):
 
 @pytest.mark.parametrize("opacity_shift", [False, True])
 def test_semantic_gradients_do_not_depend_on_the_light(train, scene, opacity_shift):
-    trainer = train(scene, iterations=8, **{SHIFT: opacity_shift})
+    trainer = train(scene, iterations=2, **{SHIFT: opacity_shift})
     model = trainer.pipeline.model
     model.train()
     camera, batch = step_camera(trainer)

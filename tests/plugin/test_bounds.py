@@ -75,7 +75,7 @@ def test_needles_and_giants_are_shortened_sheets_and_the_sky_are_not():
 
 def test_exported_colors_are_near_0_to_1_from_everywhere(planted, tmp_path):
     trainer, _ = planted(pipeline__model__densify_until=0.0, pipeline__model__view_dependence="on")
-    write_splats(tmp_path / "scene.ply", trainer.pipeline.model.splats())
+    write_splats(tmp_path / "scene.ply", trainer.pipeline.model.run.splats())
     splats = read_splats(tmp_path / "scene.ply")
     assert splats.sound().all()
     directions = torch.randn(20, 3, generator=torch.Generator().manual_seed(0))

@@ -6,7 +6,7 @@ from nerfstudio.cameras.cameras import Cameras
 from scenes import view_of
 
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.plugin.cameras import lens_of, to_nerfstudio, to_rasterizer
+from lang3dxl_ns.plugin.cameras import lens_of, photo_camera, to_nerfstudio
 from lang3dxl_ns.scene.camera import Camera, Lens, view_matrix
 
 LENS = Lens(width=64, height=48, fx=50.0, fy=57.0, cx=30.0, cy=26.0)
@@ -32,7 +32,7 @@ def test_nerfstudios_rays_and_the_rasterizers_pixels_agree(pose):
     row, column = 7, 41
     rays = cameras.generate_rays(0, coords=torch.tensor([row + 0.5, column + 0.5]))
     point = rays.origins + 3.0 * rays.directions
-    camera = to_rasterizer(cameras[0:1], pose)
+    camera = photo_camera(cameras[0:1]).camera(pose)
     x, y, z = camera.view_matrix[:3, :3] @ point + camera.view_matrix[:3, 3]
     assert z > 0
     seen = camera.intrinsics @ (torch.stack([x, y, z]) / z)
@@ -41,7 +41,7 @@ def test_nerfstudios_rays_and_the_rasterizers_pixels_agree(pose):
 
 def test_a_camera_of_ours_is_the_same_one_in_nerfstudio(pose):
     camera = LENS.camera(view_matrix(pose))
-    back: Camera = to_rasterizer(view_of(camera), view_of(camera).camera_to_worlds[0])
+    back: Camera = photo_camera(view_of(camera)).camera()
     torch.testing.assert_close(back.view_matrix, camera.view_matrix)
     torch.testing.assert_close(back.intrinsics, camera.intrinsics)
     assert (back.width, back.height) == (64, 48)

@@ -13,8 +13,10 @@ from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.files.scene_file import describe_scene_file, read_scene
 from lang3dxl_ns.files.scene_file import write_scene as write_scene_file
 from lang3dxl_ns.methods import lang3dxl
+from lang3dxl_ns.plugin.cameras import photo_camera
 from lang3dxl_ns.plugin.trainer import Lang3DXLTrainer
 from lang3dxl_ns.plugin.trainer_config import open_run, read_config
+from lang3dxl_ns.rendering import composite
 from lang3dxl_ns.scene.record import SCENE_FILE, SceneRecord
 from lang3dxl_ns.words.taught_words import TaughtWord
 
@@ -62,13 +64,18 @@ def test_features_are_gathered_at_the_cameras_that_training_refined(train, tmp_p
     data = pipeline.datamanager
     camera, _ = next(data.read(data.data.capture.split.train))
     places = model.means.detach()
-    before = model.composite(camera, places)
+
+    def drawn(model):
+        view = photo_camera(camera)
+        return composite(model.run.splats(), view.camera(model.run.pose(view)), places)
+
+    before = drawn(model)
     with torch.no_grad():
         model.camera_optimizer.pose_adjustment[camera.metadata["cam_idx"], :3] = 0.5
-    refined = model.composite(camera, places)
+    refined = drawn(model)
     assert not torch.allclose(refined, before, atol=0.05)
     # An evaluation of photos that training saw looks through the same cameras, and so do scene files.
-    assert torch.equal(model.eval().composite(camera, places), refined)
+    assert torch.equal(drawn(model.eval()), refined)
 
 
 def test_scenes_and_runs_record_the_cameras_that_training_refined(train, tmp_path):
@@ -84,7 +91,7 @@ def test_scenes_and_runs_record_the_cameras_that_training_refined(train, tmp_pat
         read_scene(trainer.base_dir / "scene.scene").file,
     ]
     for camera, batch in photos:
-        pose = model._pose(camera)
+        pose = model.run.pose(photo_camera(camera))
         assert not torch.allclose(pose, camera.camera_to_worlds[0], atol=1e-3)
         for file in recorded:
             known = torch.tensor(file.photo(batch["name"]).camera_to_world)

@@ -12,7 +12,8 @@ from lang3dxl_ns.components.compression import CompressionConfig
 from lang3dxl_ns.components.decoders import DecoderConfig
 from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
 from lang3dxl_ns.evaluation.score_run import score_features
-from lang3dxl_ns.plugin.cameras import to_rasterizer
+from lang3dxl_ns.plugin.cameras import photo_camera
+from lang3dxl_ns.rendering import composite
 from lang3dxl_ns.training.snapshot import snapshot
 
 
@@ -49,17 +50,17 @@ def test_a_decoder_trains_gives_features_of_the_targets_width_and_is_the_same_on
     model = trainer.pipeline.model.eval()
     camera, batch = next(iter(trainer.pipeline.datamanager.fixed_indices_eval_dataloader))
     _, images = model.get_image_metrics_and_images(model.get_outputs_for_camera(camera), batch)
-    assert model.semantic_field.decode_clip(model.carried).shape[-1] == batch["clip_target"].shape[-1]
+    assert model.semantic_field.decode_clip(model.run.carried).shape[-1] == batch["clip_target"].shape[-1]
     assert images["bottleneck"].shape[-1] == 3
     run, data = model.run, trainer.pipeline.datamanager.data
-    side, view = model.config.decode_size[1], to_rasterizer(camera)
+    side, view = model.config.decode_size[1], photo_camera(camera).camera()
     metrics = score_features(snapshot(run, data.record()), run.parts.semantics, view, batch, side)
     without_dense = name in ("langsplat", "gathered", "lifting")
     assert metrics["clip_l1"] < 10 and ("dense_l1" in metrics) is not without_dense
     _, pipeline, _, _ = eval_setup(trainer.base_dir / "config.yml", test_mode="inference")
     loaded = pipeline.model.eval()
     with torch.no_grad():
-        maps = [m.composite(camera, m.carried.nan_to_num(7.0)) for m in (loaded, model)]
+        maps = [composite(m.run.splats(), view, m.run.carried.nan_to_num(7.0)) for m in (loaded, model)]
     torch.testing.assert_close(*maps)
 
 

@@ -9,7 +9,7 @@ from lang3dxl_ns.components.appearance import Look
 from lang3dxl_ns.components.losses import rgb_loss
 from lang3dxl_ns.evaluation.half_image import HalfImageProtocol
 from lang3dxl_ns.evaluation.photo_metrics import corrected_psnr, psnr
-from lang3dxl_ns.plugin.cameras import to_rasterizer
+from lang3dxl_ns.plugin.cameras import photo_camera
 
 USE = "pipeline__model__appearance__use"
 SHIFT = "pipeline__model__appearance__opacity_shift"
@@ -40,16 +40,16 @@ def photo(pipeline):
 
 def protocol(model):
     background, weight = model._get_background_color(), model.config.ssim_lambda
-    return HalfImageProtocol(model.splats(), model.appearance, model.image_metrics, background, weight)
+    return HalfImageProtocol(model.run.splats(), model.appearance, model.image_metrics, background, weight)
 
 
 def half_image(model, camera, batch):
     mask = batch["mask"][..., 0] if "mask" in batch else None
-    return protocol(model).measure(to_rasterizer(camera), model.get_gt_img(batch["image"]), mask)
+    return protocol(model).measure(photo_camera(camera).camera(), model.get_gt_img(batch["image"]), mask)
 
 
 def fit_look(model, camera, left, steps):
-    return protocol(model).fit(to_rasterizer(camera), left, steps=steps)
+    return protocol(model).fit(photo_camera(camera).camera(), left, steps=steps)
 
 
 def halves(image):

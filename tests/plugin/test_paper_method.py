@@ -10,7 +10,6 @@ import lab.baselines  # noqa: F401, which registers fmgs
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.methods import METHODS, lang3dxl_paper
 from lang3dxl_ns.plugin import trainer as trainer_module
-from lang3dxl_ns.plugin.optimizers import RunSchedule
 
 ITERATIONS = 70_000
 
@@ -27,7 +26,7 @@ def fitted():
 def rate(config, group, step):
     """Learning rate of a group at a step."""
     optimizer, scheduler = (config.optimizers[group][part] for part in ("optimizer", "scheduler"))
-    return optimizer.lr * (1.0 if scheduler is None else RunSchedule(scheduler).multiple(step))
+    return optimizer.lr * (1.0 if scheduler is None else scheduler.multiple(step))
 
 
 @pytest.mark.parametrize(
@@ -179,6 +178,6 @@ def test_the_dense_loss_is_compared_at_its_target_and_sees_what_the_mask_leaves_
 
 
 def test_a_run_has_words_at_its_last_iteration_and_reads_as_this_method(trained):
-    assert not trained.pipeline.has_words_to_learn
+    assert not trained.pipeline.model.run.learns_words_at_the_end
     assert trained.base_dir.parent.name == "lang3dxl-paper"
     assert list(trained.base_dir.glob("*.scene"))

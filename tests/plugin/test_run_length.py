@@ -13,7 +13,7 @@ from lang3dxl_ns.training.learning_rates import LONG_RUN, SHORT_RUN
 
 @pytest.mark.parametrize("steps", [10, 1000, 30_000])
 def test_a_schedule_has_the_same_shape_at_every_length(steps):
-    schedule = RunScheduleConfig(start=0.1, warm=0.2, end=0.01, power=2.0, total_steps=steps).setup()
+    schedule = RunScheduleConfig(start=0.1, warm=0.2, end=0.01, power=2.0, total_steps=steps)
     assert schedule.multiple(0) == pytest.approx(0.1)
     assert schedule.multiple(round(0.2 * steps)) == pytest.approx(1.0)
     assert schedule.multiple(steps) == pytest.approx(0.01)
@@ -21,7 +21,7 @@ def test_a_schedule_has_the_same_shape_at_every_length(steps):
 
 
 def test_log_linear_decay_halves_the_exponent_halfway():
-    schedule = RunScheduleConfig(shape="log-linear", end=0.01, total_steps=100).setup()
+    schedule = RunScheduleConfig(shape="log-linear", end=0.01, total_steps=100)
     assert schedule.multiple(50) == pytest.approx(0.1)
 
 

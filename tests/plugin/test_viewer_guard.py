@@ -100,3 +100,24 @@ def test_windows_without_an_aspect_ratio_are_passed_over(viewer, aspect):
         assert [client.camera.aspect for client in clients.values()] == [1.5]
     while viewer.get_clients() and time.monotonic() < end:
         time.sleep(0.01)
+
+
+BAD = ["text", b"", b"\xc1", b"\x80", b"\x91" * 5_000, msgspec.msgpack.encode({"type": "NoSuchMessage"})]
+
+
+@pytest.mark.parametrize("message", BAD)
+def test_a_client_that_sends_no_message_of_the_page_is_forgotten(viewer, message):
+    states = viewer._websock_server._client_state_from_id
+    with session(viewer) as socket_:
+        socket_.send(msgspec.msgpack.encode(CAMERA))
+        until(viewer.get_clients)  # only then has viser finished to add it
+        socket_.send(message)
+        until(lambda: not viewer.get_clients() and not states)
+
+
+def until(true):
+    """Wait until something is true, at most a minute."""
+    end = time.monotonic() + 60
+    while not true():
+        assert time.monotonic() < end
+        time.sleep(0.01)

@@ -10,7 +10,6 @@ import torch
 from tiny_models import make_tiny_clip, make_tiny_dinov2
 
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.plugin.datamanager import Lang3DXLDataManagerConfig
 from lang3dxl_ns.preparation import encoders
 from lang3dxl_ns.preparation.encoders import load_dense_encoder, load_image_text_encoder
 from lang3dxl_ns.preparation.model_files import (
@@ -19,6 +18,8 @@ from lang3dxl_ns.preparation.model_files import (
     find_model,
     usual_clip,
 )
+from lang3dxl_ns.preparation.settings import PreparationConfig
+from lang3dxl_ns.training.batches import settle
 
 TEXTS = ["a rose window", "minaret", "the dome of a mosque, seen from far away in the evening light"]
 
@@ -238,8 +239,8 @@ def test_half_precision_on_the_gpu_stays_close_to_the_cpu(clip_folder, dino_fold
     ],
 )
 def test_the_built_in_clip_takes_the_built_in_dense_encoder_along(clip, dense, learned, expected):
-    config = Lang3DXLDataManagerConfig(clip=clip, dense=dense)
-    config.settle_targets(learned, not learned)
+    config = PreparationConfig(clip=clip, dense=dense)
+    settle(config, learned, not learned)
     assert config.dense == expected
 
 

@@ -17,7 +17,7 @@ from lang3dxl_ns.preparation.segmentation import ClipSeg
 from lang3dxl_ns.preparation.settings import PreparationConfig
 from lang3dxl_ns.preparation.store import FeatureStore
 from lang3dxl_ns.scene.camera import Lens
-from lang3dxl_ns.scene.masks import find_mask
+from lang3dxl_ns.scene.masks import MaskFolder
 from lang3dxl_ns.scene.photo import Photo
 
 NAMES = ["north/a.png", "north/b.png", "c.png"]
@@ -93,13 +93,13 @@ def test_masks_count_from_half_brightness(photos, tmp_path):
 @pytest.mark.parametrize("file", ["a.png", "a.jpg", "a.JPG", "a.jpeg", "a.jpg.png"])
 def test_a_mask_is_named_like_its_photo(tmp_path, file):
     make_mask(tmp_path / "north" / file)
-    assert find_mask(tmp_path, "north/a.jpg") == tmp_path / "north" / file
-    assert find_mask(tmp_path, "south/a.jpg") is None
+    assert MaskFolder(tmp_path).find("north/a.jpg") == tmp_path / "north" / file
+    assert MaskFolder(tmp_path).find("south/a.jpg") is None
 
 
 def test_auto_keeps_what_the_data_has_and_none_drops_it(photos, tmp_path):
     make_mask(tmp_path / "masks" / "c.png")
-    found = [replace(photo, mask_path=find_mask(tmp_path / "masks", photo.name)) for photo in photos]
+    found = [replace(photo, mask_path=MaskFolder(tmp_path / "masks").find(photo.name)) for photo in photos]
     lines = []
     assert run(found, PreparationConfig(), tmp_path, lines.append) == found
     assert "north/a.png, north/b.png" in lines[0]

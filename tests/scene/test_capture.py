@@ -347,7 +347,10 @@ def test_points_without_colors_are_gray(tmp_path, capsys):
     assert colors.tolist() == [[128, 128, 128]] and "no colors" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("content", [b"", b"ply\n", b"ply\nformat ascii 1.0\nend_header\n"])
+HUGE = b"ply\nformat binary_little_endian 1.0\nelement vertex 999999999999\nproperty float x\nend_header\n"
+
+
+@pytest.mark.parametrize("content", [b"", b"ply\n", b"ply\nformat ascii 1.0\nend_header\n", HUGE])
 def test_damaged_points_are_named(tmp_path, content):
     (tmp_path / "a.ply").write_bytes(content)
     with pytest.raises(UserError, match=r"the points of .*a\.ply can't be read"):

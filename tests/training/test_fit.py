@@ -151,3 +151,11 @@ def test_a_finished_run_is_not_trained_again_and_another_one_is_refused(
     trained(data, tmp_path, settings(4))
     with pytest.raises(UserError, match="holds a run with another steps"):
         trained(data, tmp_path, settings(5))
+
+
+def test_mixed_precision_without_such_a_gpu_is_refused_before_anything_is_prepared(data, settings, tmp_path):
+    made = settings()
+    made.mixed_precision = True
+    with pytest.raises(UserError, match="--mixed-precision needs a GPU"):
+        begin(open_capture(data), made, tmp_path / "run", tmp_path / "cache", "cpu")
+    assert not list(tmp_path.iterdir())

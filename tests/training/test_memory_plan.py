@@ -20,7 +20,9 @@ def model(scene, train):
 
 def cap(model, memory, monkeypatch, pixels=700_000, wanted=None):
     monkeypatch.setattr(sizes, "memory_to_plan_with", lambda device: memory)
-    return sizes.plan(model.run, pixels, torch.device("cpu"), wanted)[0]
+    model.run.settings.max_gaussians = wanted
+    sizes.plan(model.run, [SimpleNamespace(width=pixels, height=1)])
+    return model.run.densification.most
 
 
 @pytest.mark.parametrize("gaussians", [10_000, 3_000_000])
@@ -48,9 +50,8 @@ def test_sums_of_many_threads_are_planned_with(model, monkeypatch):
 def test_the_present_gaussians_are_kept_and_a_wish_is_obeyed(model, monkeypatch):
     assert cap(model, 1e6, monkeypatch) == model.num_points  # too little
     assert cap(model, 1e6, monkeypatch, wanted=70) == 70
-    monkeypatch.setattr(sizes, "memory_to_plan_with", lambda device: 1e6)
-    most, message = sizes.plan(model.run, 100, torch.device("cpu"), wanted=0)
-    assert most == 0 and "no limit" in message
+    assert cap(model, 1e6, monkeypatch, wanted=0) == 0
+    assert "no limit" in sizes.plan(model.run, [SimpleNamespace(width=10, height=10)])
 
 
 def test_the_time_of_training_is_told_before_it_and_telling_changes_nothing(scene, train, monkeypatch):

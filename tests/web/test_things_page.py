@@ -7,8 +7,8 @@ from painted_scene import painted_scene
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.things.find import Things
-from lang3dxl_ns.things.grammar import Sight, answer, parse
-from lang3dxl_ns.things.join import join, without_crumbs
+from lang3dxl_ns.things.grammar import Sight, answer, parse, unsure
+from lang3dxl_ns.things.join import Joined, join, stacked, without_crumbs
 from lang3dxl_ns.things.pieces import LEAST, Piece, split
 from lang3dxl_ns.things.thing import Thing, upright_box
 from lang3dxl_ns.web.write_page import Page, write_page
@@ -55,42 +55,44 @@ def test_a_question_is_read_as_by_python(page, text):
     assert found == expected
 
 
-def test_questions_choose_the_things_that_python_chooses(page):
+SUPERLATIVES = ("", "highest ", "widest ", "leftmost ", "largest ")
+RELATIONS = (*("left of", "right of", "above", "below", "next to", "between", "in", "in front of", "behind"),)
+ASKED = [f"{first}window {relation} the portal" for relation in RELATIONS for first in SUPERLATIVES]
+ASKED += ["smallest window", "tallest tower", "third window from the left", "second tower from the top",
+          "ninth window from the right", "how many windows above the tower"]  # fmt: skip
+
+
+def test_questions_choose_the_things_that_python_chooses_and_are_as_unsure(page):
     rng = np.random.default_rng(3)
-    words = {"window": 9, "portal": 2, "tower": 3}
     found, number = [], 0
-    for word, count in words.items():
+    for word, count, perhaps in (("window", 9, 2), ("windows", 9, 2), ("portal", 2, 0), ("tower", 3, 1)):
         things = []
-        for _ in range(count):
+        for _ in range(count + perhaps):
             number += 1
             center, size = rng.uniform(0, 9, 3), rng.uniform(0.5, 3, 3)
-            things.append(Thing(number, word, 1.0, 3, center, np.eye(3), size, np.array([number])))
-        found.append(Things(word, things, count, count))
-    numbers = ("center", "axes", "size")
-    listed = {
-        one.word: [{"id": t.id, **{name: getattr(t, name).tolist() for name in numbers}} for t in one.things]
-        for one in found
-    }
+            views = int(rng.integers(2, 12))
+            things.append(Thing(number, word, 1.0, views, center, np.eye(3), size, np.array([number])))
+        found.append(Things(word, things[:count], things[count:]))
+
+    def listed(things: list[Thing]) -> list[dict]:
+        numbers = ("center", "axes", "size")
+        return [{"id": t.id, "views": t.views} | {name: getattr(t, name).tolist() for name in numbers}
+                for t in things]  # fmt: skip
+
+    given = {one.word: {"things": listed(one.things), "candidates": listed(one.candidates)} for one in found}
     view = {name: getattr(SIGHT, name).tolist() for name in ("right", "up", "ahead")}
-    some = 0
-    for relation in (
-        "left of",
-        "right of",
-        "above",
-        "below",
-        "next to",
-        "between",
-        "in",
-        "in front of",
-        "behind",
-    ):
-        for start in ("", "highest ", "widest ", "leftmost "):
-            text = f"{start}window {relation} the portal"
-            expected = [t.id for t in answer(parse(text), found, lambda _: SIGHT)]
-            body = "return m.answerTo(m.parse(given.text), given.things, given.view).map(({ id }) => id);"
-            assert module(page, "grammar", body, {"text": text, "things": listed, "view": view}) == expected
-            some += len(expected)
-    assert some > 20
+    body = """const { found, view } = given;
+      const things = Object.fromEntries(Object.entries(found).map(([word, one]) => [word, one.things]));
+      return given.asked.map((text) => {
+        const request = m.parse(text), chosen = m.answerTo(request, things, view);
+        return [chosen.map(({ id }) => id), m.unsure(request, found, view)];
+      });"""
+    answers = module(page, "grammar", body, {"asked": ASKED, "found": given, "view": view})
+    for text, (chosen, doubt) in zip(ASKED, answers, strict=True):
+        assert chosen == [t.id for t in answer(parse(text), found, lambda _: SIGHT)], text
+        assert doubt == unsure(parse(text), found, lambda _: SIGHT), text
+    assert sum(len(chosen) for chosen, _ in answers) > 20
+    assert 5 < sum(doubt is None for _, doubt in answers) < len(ASKED) - 5
 
 
 def numbered(labels) -> list[int]:
@@ -132,6 +134,25 @@ def test_pieces_join_as_in_python(page):
     found = module(page, "things", body, {"pieces": given, "weight": weight.tolist()})
     assert len(found) > 5
     assert sorted(found) == sorted([sorted(one.rows.tolist()), one.views] for one in expected)
+
+
+def test_slim_things_join_with_what_stands_on_them_as_in_python(page):
+    rng = np.random.default_rng(4)
+    count = 40
+    boxes = [
+        (rng.uniform(0, 9, 3), np.eye(3), rng.uniform((0.3, 0.3, 0.3), (0.6, 0.6, 4))) for _ in range(count)
+    ]
+    parts = [Joined(np.array([i]), 1.0, []) for i in range(count)]
+    expected = sorted(sorted(one.rows.tolist()) for one in stacked(parts, boxes))
+    assert 5 < len(expected) < count
+    given = {
+        "parts": [{"rows": [i], "weight": 1, "votes": []} for i in range(count)],
+        "boxes": [
+            dict(zip(("center", "axes", "size"), map(np.ndarray.tolist, box), strict=True)) for box in boxes
+        ],
+    }
+    body = "return m.stacked(given.parts, given.boxes).map(({ rows }) => rows.toSorted((a, b) => a - b));"
+    assert sorted(module(page, "things", body, given)) == expected
 
 
 def test_boxes_are_those_of_python(page):
