@@ -102,7 +102,7 @@ async function ask(typed, turn = cleared) {
 
 /** Answer a question about things, such as "how many windows" or "highest tower". */
 async function answerQuestion(typed) {
-  const told = await list.question(typed, async (word) => (await ask(`"${word}"`)).known);
+  const told = await list.question(typed, async (word) => (await ask(quoted(word))).known);
   if (told) say(told);
   return { known: told !== null, told };
 }
@@ -262,7 +262,7 @@ async function tell({ x, y, without }) {
   if (list.pick(rows)) return;
   const best = words[0]?.[1] ?? 0;
   const tied = words.filter(([, score]) => score > best - TIE), several = tied.length > 2;
-  const buttons = (several ? tied : words).map(([word, score]) => choice(several ? word : `${word} ${percent(score)}`, () => ask(word)));
+  const buttons = (several ? tied : words).map(([word, score]) => choice(several ? word : `${word} ${percent(score)}`, () => ask(quoted(word))));
   quiet();
   const told = several ? "Here several words fit equally well, so none is sure:" : "Here, words that fit best:";
   $("here").replaceChildren(element("p", {}, words.length ? told : `Nothing is there${rows.length ? " that has a name" : ""}.`),
@@ -380,7 +380,8 @@ function namedWord(text) {
 
 // ── address ──
 
-const asTyped = ({ text, negatives }) => `"${text}"` + (negatives.length ? ` not ${negatives.map((one) => `"${one}"`).join(", ")}` : "");
+const quoted = (text) => `"${text}"`;
+const asTyped = ({ text, negatives }) => quoted(text) + (negatives.length ? ` not ${negatives.map(quoted).join(", ")}` : "");
 
 function asField(prompt) {
   const { examples, color, chosen } = prompt;
@@ -467,7 +468,7 @@ async function offer() {
 async function suggest() {
   const known = about.suggested.length ? about.suggested : await think("offered", { typed: "" });
   const words = [...new Set([...kept.list("words").map(({ name }) => String(name)), ...known])];
-  $("try").replaceChildren("Try: ", ...words.slice(0, MOST_TRIED).map((word) => choice(word, () => ask(word))));
+  $("try").replaceChildren("Try: ", ...words.slice(0, MOST_TRIED).map((word) => choice(word, () => ask(quoted(word)))));
 }
 
 function on(id, kind, act) {
