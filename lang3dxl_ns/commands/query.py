@@ -40,7 +40,7 @@ _LEAST_PART = 1e-4
 _NEAREST = Image.Resampling.NEAREST
 _READ_BY: dict[str, tuple[str, ...]] = dict.fromkeys(("title", "credit", "license"), ("web", "scene_file"))
 _READ_BY |= dict.fromkeys(("text", "not_", "look"), ("out", "web"))
-_READ_BY |= {"vocabulary": ("web",), "photos": ("web",), "all": ("out",), "hide_floaters": ("out", "web")}
+_READ_BY |= {"vocabulary": ("web",), "photos": ("web",), "all": ("out",), "hide_floaters": ("out",)}
 """Targets of `export` that read an option. Options that are not listed are read by every target."""
 _Not = Annotated[tyro.conf.UseAppendAction[list[str]], tyro.conf.arg(name="not")]
 
@@ -247,7 +247,7 @@ class Export:
     all: bool = False
     """Write all Gaussians. With --text, a .ply has their relevancy as a property."""
     hide_floaters: bool = False
-    """Leave out Gaussians that float where no surface is, and the sky's. A page opens with them hidden."""
+    """Leave out Gaussians that float where no surface is. A page opens with them hidden anyway."""
     index: Path | None = None
     """File (.npy or .txt) for the indices of the matching Gaussians, in the order of the scene, which is also
     the order of the splat that it was attached to. It needs --text and --out."""
@@ -288,7 +288,6 @@ class Export:
             own = read_names(self.vocabulary, "words") if self.vocabulary else ()
             words = self._clip_words(scene.file.clip)
             page = Page(scene, prompts, own, words, self._told(), self.look, self.photos)
-            page.hide_floaters = self.hide_floaters
             size = write_page(page, self.web)
             for left_out in page.left_out:
                 say(f"{left_out}.")
