@@ -13,10 +13,11 @@ import tyro
 
 from lang3dxl_ns.common.checks import check_address
 from lang3dxl_ns.common.console import say
+from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.settings_help import showing
 
 
-@showing("scene", "text", "photos", "host", "port", "browser")
+@showing("scene", "text", "photos", "tour", "host", "port", "browser")
 @dataclass(kw_only=True)
 class View:
     """Explore and query a scene in a browser.
@@ -35,6 +36,8 @@ class View:
     """Address to serve at. 0.0.0.0 opens it to the network, with the token shown in the terminal."""
     port: int | None = None
     """Port to serve at. The default is a free one from 7007 on."""
+    tour: bool = False
+    """Play the tour that the page kept in the scene's file (Tour, Keep this view)."""
     browser: bool = True
     """Open the page in a browser, on a machine with a desktop (--no-browser: only print the address)."""
     clip: str | None = None
@@ -48,17 +51,19 @@ class View:
         from lang3dxl_ns.web.write_page import Page
 
         check_address(self.host, self.port)  # fail now rather than after the work
-        scene = load_scene(self.scene, clip=self.clip)
-        file = find_scene_file(self.scene)
-        told, photos = provenance_of(self.scene), self.photos or folder_of_run(file)
+        file, told = find_scene_file(self.scene), provenance_of(self.scene)
+        if self.tour and not told.tour:
+            raise UserError("the scene's file has no tour: keep views in the page (Tour, Keep this view)")
+        scene, photos = load_scene(self.scene, clip=self.clip), self.photos or folder_of_run(file)
         page = Page(scene, self.text, provenance=told, photos=photos, live=True, own_words=PageWords(file))
         server = PageServer(page, self.host, self.port)
         who = "anyone with this address" if server.access.needs_token else "this machine only"
-        say(f"Open {server.access.address} ({who}). Ctrl-C ends it.")
+        address = server.access.address + "#play=1" * self.tour
+        say(f"Open {address} ({who}). Ctrl-C ends it.")
         if elsewhere := server.access.elsewhere:
             say(f"From other machines: {elsewhere}")
         if self.browser and _has_display():
-            webbrowser.open(server.access.address)
+            webbrowser.open(address)
         with contextlib.suppress(KeyboardInterrupt), server:
             server.serve_forever()
 
@@ -88,6 +93,7 @@ class Info:
             "photos": f"{told['photos']}{', each with its lighting' if told['looks'] else ''}",
             "words": words,
             "meters": told["scene"].georeference,
+            "tour": f"{stops} stops" if (stops := told["provenance"].tour.count("stop=")) else "",
             "size": f"{told['bytes'] / 1e6:.2f} MB, {told['bytes'] / max(count, 1):.0f} bytes a Gaussian",
         }
         say(*(f"{name:10} {' '.join(str(value).split())}" for name, value in lines.items() if value))

@@ -75,6 +75,8 @@ class Provenance:
     """Program and version that wrote the file."""
     made_how: str = ""
     """How the scene was made, in one line: the method, its decoder and its iterations."""
+    tour: str = ""
+    """Stops of a tour, as the page's link holds them."""
 
 
 # ── writing ─────────────────────────────────────────────────────────────────────────────────────────────
@@ -154,31 +156,36 @@ def _carried(kind: str, scene: Scene, record: bytes) -> bytes:
     return glb.encode_glb(splats, record, codes, place=scene.file.georeference)
 
 
-def keep_words(path: Path, words: Mapping[str, TaughtWord | None]) -> None:
-    """Replace some of a scene file's taught words (None: forget it), and nothing else, atomically. Words that
-    another command taught meanwhile stay. Raises UserError as `read_scene`."""
+def keep_words(path: Path, words: Mapping[str, TaughtWord | None], tour: str | None = None) -> None:
+    """Replace some of a scene file's taught words (None: forget it) and its tour, if one is given, and
+    nothing else, atomically. Words that another command taught meanwhile stay. Raises UserError as
+    `read_scene`."""
     from safetensors.numpy import save
 
     if path.suffix in _CARRIERS:
         raise UserError(
-            f"{path} keeps no words: write a scene, lang3dxl export {path} --scene-file NAME{SUFFIX}"
+            f"{path} can't be changed: write a scene, lang3dxl export {path} --scene-file NAME{SUFFIX}"
         )
     with _opened(path) as file:
         kept = {**{known_word(word.name): word for word in file.taught}, **words}
         described = file.about | {"taught": [word.to_json() for word in kept.values() if word is not None]}
+        described["provenance"] |= {} if tour is None else {"tour": tour}
         content = {name: file.array(name) for name in file.shapes}
     write_atomically(path, save(content, {_KEY: json.dumps(described)}))
 
 
 def replace_scene(path: Path, scene: Scene, told: Provenance, *earlier: Path) -> tuple[Scene, int]:
     """Write a scene over the file that it replaces, as `write_scene`, with the words taught there and in
-    `earlier` files, and with its credit and license unless others are told. Return the written
+    `earlier` files, and with its credit, license and tour unless others are told. Return the written
     scene and the number of bytes. A command that teaches there at this moment comes first, or waits."""
     with file_locked(path):
         if path.is_file():
             try:
                 old = describe_scene_file(path)["provenance"]
-                told = replace(told, credit=told.credit or old.credit, license=told.license or old.license)
+                kept = {
+                    name: getattr(told, name) or getattr(old, name) for name in ("credit", "license", "tour")
+                }
+                told = replace(told, **kept)
             except UserError as error:  # a newer format, a cut copy, or no scene at all
                 say(f"{error}. The file is kept as {set_aside(path)}")
         for file in (path, *earlier):

@@ -20,6 +20,7 @@ from lang3dxl_ns.query.scene import Scene, text_encoder
 from lang3dxl_ns.query.text import EncodeTexts, caution
 from lang3dxl_ns.rendering import Rendering
 from lang3dxl_ns.scene.record import SceneRecord
+from lang3dxl_ns.things.find import Things, things_of
 from lang3dxl_ns.training.learn_codes import forget_words
 from lang3dxl_ns.training.snapshot import snapshot
 from lang3dxl_ns.training.state import Training
@@ -92,6 +93,11 @@ class Conversation:
         if question is self.question:
             self.found = found
         return found
+
+    def things(self) -> list[Things]:
+        """Find the single things of each prompt, which takes seconds."""
+        assert self._asked is not None
+        return things_of(*self._asked)
 
     def _scene_now(self) -> Scene:
         """Return a snapshot of the present model. After training there is one final snapshot; during training

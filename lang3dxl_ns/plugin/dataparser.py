@@ -14,6 +14,7 @@ from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
+from torch import Tensor
 
 from lang3dxl_ns.common.console import say, silence_libraries
 from lang3dxl_ns.common.errors import UserError
@@ -23,6 +24,7 @@ from lang3dxl_ns.plugin.cameras import to_nerfstudio
 from lang3dxl_ns.plugin.inert_settings import OF_COLMAP
 from lang3dxl_ns.scene.capture import Capture, CaptureSettings, find_source, open_capture, say_left_out
 from lang3dxl_ns.scene.frame import Frame
+from lang3dxl_ns.scene.photo import Photo
 from lang3dxl_ns.scene.record import SCENE_FILE, SceneRecord
 from lang3dxl_ns.scene.transforms import TRANSFORMS
 
@@ -62,6 +64,21 @@ class CaptureOutputs(DataparserOutputs):
 
     frame: Frame | None = None
 
+    @classmethod
+    def of(
+        cls, photos: list[Photo], poses: Tensor, side: float, frame: Frame, **seeds: Tensor
+    ) -> CaptureOutputs:
+        """Describe photos in a cube from -`side` to `side`, with the points to start from."""
+        return cls(
+            image_filenames=[photo.path for photo in photos],
+            cameras=to_nerfstudio([photo.lens for photo in photos], poses),
+            scene_box=SceneBox(torch.tensor([[-side] * 3, [side] * 3])),
+            metadata={"photos": photos, **seeds},
+            dataparser_transform=torch.from_numpy(frame.transform).float(),
+            dataparser_scale=frame.scale,
+            frame=frame,
+        )
+
     def save_dataparser_transform(self, path: Path) -> None:
         """Write the frame for other programs, as nerfstudio does, but unrounded."""
         assert self.frame is not None
@@ -86,21 +103,11 @@ class PhotoCollectionDataParser(DataParser):
                 "(`lang3dxl-colmap --eval-mode all` after all other options trains on all)"
             )
         points, colors = map(torch.from_numpy, capture.seeds)
-        # Without points in a transforms.json, which is allowed, training starts from random ones.
-        seeds = capture.transforms is None or len(points) > 0
-        side, frame = self.config.scene_scale, capture.recorded_frame
-        return CaptureOutputs(
-            image_filenames=[photo.path for photo in photos],
-            cameras=to_nerfstudio([photo.lens for photo in photos], poses),
-            scene_box=SceneBox(torch.tensor([[-side] * 3, [side] * 3])),
-            metadata={
-                "photos": photos,
-                **({"points3D_xyz": points, "points3D_rgb": colors} if seeds else {}),
-            },
-            dataparser_transform=torch.from_numpy(frame.transform).float(),
-            dataparser_scale=frame.scale,
-            frame=frame,
-        )
+        seeds = {"points3D_xyz": points, "points3D_rgb": colors}
+        if capture.transforms is not None and not len(points):  # allowed: training starts from random ones
+            seeds = {}
+        side = self.config.scene_scale
+        return CaptureOutputs.of(photos, poses, side, capture.recorded_frame, **seeds)
 
     @cached_property
     def capture(self) -> Capture:
@@ -141,21 +148,10 @@ class RecordedSceneDataParser(DataParser):
         chosen = chosen or scene.photos  # with --eval-mode all, no photo is held out
         photos = [photo.photo(Path(scene.data)) for photo in chosen]
         poses = torch.tensor([photo.camera_to_world for photo in chosen], dtype=torch.float32)
-        cameras = to_nerfstudio([photo.lens for photo in photos], poses)
-        return CaptureOutputs(
-            image_filenames=[photo.path for photo in photos],
-            cameras=cameras,
-            scene_box=SceneBox(torch.tensor([[-1.0] * 3, [1.0] * 3])),
-            metadata={
-                "photos": photos,
-                # The checkpoint brings its own Gaussians, so start with as few as possible.
-                "points3D_xyz": torch.eye(4)[:, :3],
-                "points3D_rgb": torch.zeros(4, 3),
-            },
-            dataparser_transform=torch.tensor(scene.transform, dtype=torch.float32),
-            dataparser_scale=scene.scale,
-            frame=Frame(np.array(scene.transform, np.float64), scene.scale),
-        )
+        frame = Frame(np.array(scene.transform, np.float64), scene.scale)
+        # The checkpoint brings its own Gaussians, so start with as few as possible.
+        few, colors = torch.eye(4)[:, :3], torch.zeros(4, 3)
+        return CaptureOutputs.of(photos, poses, 1.0, frame, points3D_xyz=few, points3D_rgb=colors)
 
 
 def recorded_scene(run: Path | None) -> RecordedSceneDataParserConfig | None:

@@ -23,6 +23,7 @@ from lang3dxl_ns.plugin.viewer_guard import guard_viewers
 from lang3dxl_ns.query.match import Found
 from lang3dxl_ns.scene.camera import Camera
 from lang3dxl_ns.scene.record import SceneRecord, overview
+from lang3dxl_ns.things.thing import Thing
 
 if TYPE_CHECKING:
     from nerfstudio.engine.trainer import Trainer
@@ -33,6 +34,7 @@ INVITATION = (
     "A finished run has a richer page: `lang3dxl view`."
 )
 NO_SEMANTICS = "This run has no semantics (it was trained with clip none)."
+_NOWHERE = "…"
 _TYPING = 0.5
 """Seconds after the last keystroke until the text takes effect."""
 
@@ -61,6 +63,8 @@ class AskPanel(ViewerControl):
         self._pipeline, self._model = pipeline, pipeline.model
         self._views: list[tuple[Found, int]] = []
         """Views to fly to: pairs of a match and its view's number, all best views before all second ones."""
+        self._things: dict[str, Thing] = {}
+        """Single things of the question, by their names in the list."""
         self._place = -1
         self._first_frame = True
 
@@ -89,9 +93,13 @@ class AskPanel(ViewerControl):
         self._question = gui.add_text("Look for", "", hint="Several prompts are separated by ;")
         self._message = gui.add_markdown(INVITATION)
         self._fly = gui.add_button("Fly to the next view", icon=viser.Icon.PLANE, visible=False)
+        self._count = gui.add_button("Count single things", icon=viser.Icon.LIST_NUMBERS, visible=False)
+        self._listed = gui.add_dropdown("Fly to", (_NOWHERE,), visible=False)
         self._status = gui.add_markdown("")
         self._question.on_update(lambda _: self._asker.submit(self._ask, _TYPING))
         self._fly.on_click(lambda event: self._fly_on(event.client))
+        self._count.on_click(lambda _: self._finder.submit(self._list))
+        self._listed.on_update(lambda event: self._fly_to(event.client))
 
     def _start(self, viewer: Viewer) -> None:
         self.conversation = Conversation(
@@ -156,6 +164,21 @@ class AskPanel(ViewerControl):
         most = max((len(one.views) for one in found), default=0)
         self._views = [(one, i) for i in range(most) for one in found if i < len(one.views)]
         self._place, self._fly.visible = -1, bool(self._views)
+        self._things, self._count.visible, self._listed.visible = {}, bool(self._views), False
+
+    def _list(self) -> None:
+        """List the question's single things, to fly to each."""
+        question = self.conversation.question
+        if question is None:
+            return
+        self._say("Looking for single things…")
+        answers = self.conversation.things()
+        if question is self.conversation.question:
+            self._things = {
+                f"{one.word} {n}": thing for one in answers for n, thing in enumerate(one.things, 1)
+            }
+            self._listed.options, self._listed.visible = (_NOWHERE, *self._things), bool(self._things)
+            self._say("  \n".join(f"**{plain(one.word)}**: {one.count} found" for one in answers))
 
     # ── showing ─────────────────────────────────────────────────────────────────────────────────────
 
@@ -199,6 +222,13 @@ class AskPanel(ViewerControl):
             f"{text}, {number + 1} of {len(found.views)}: {plain(view.name)}, {view.area:.0%} of it matches"
         )
         _place_camera(client, view.camera, None if found.box is None else found.box.center)
+
+    def _fly_to(self, client: viser.ClientHandle | None) -> None:
+        """Fly to the thing that is chosen in the list, where the photo that shows it best was taken."""
+        thing = self._things.get(self._listed.value)
+        if client is not None and thing is not None:
+            camera = self._pipeline.scene_file.photo(thing.sightings[0].photo).camera
+            _place_camera(client, camera, tuple(thing.center.tolist()))
 
 
 def _place_camera(client: viser.ClientHandle, camera: Camera, target: tuple[float, ...] | None) -> None:

@@ -2,20 +2,14 @@
 
 from __future__ import annotations
 
-import pickle
 import zipfile
 import zlib
 from pathlib import Path
 from typing import Any
 
-import torch
-from torch import Tensor
-
-from lang3dxl_ns.common.errors import DAMAGE, UserError, not_of_memory
+from lang3dxl_ns.common.errors import UserError, readable
 from lang3dxl_ns.common.files import check_regular
-
-NOT_A_CHECKPOINT = (*DAMAGE, pickle.UnpicklingError)
-"""Exceptions raised when a file that is not a checkpoint is read."""
+from lang3dxl_ns.training.checkpoint import NOT_A_CHECKPOINT, load_checked
 
 
 def latest_checkpoint(folder: Path) -> tuple[Path, dict[str, Any]]:
@@ -30,32 +24,12 @@ def latest_checkpoint(folder: Path) -> tuple[Path, dict[str, Any]]:
 
 def read_checkpoint(path: Path) -> dict[str, Any]:
     """Load the content of any nerfstudio run's checkpoint on the CPU. Raises UserError for another file."""
-    try:
-        check_regular(path)
-        state = torch.load(path, map_location="cpu", weights_only=True)
-    except NOT_A_CHECKPOINT as error:
-        not_of_memory(error)
-        raise _no_checkpoint(path, error) from error
-    shape = {"pipeline": dict, "step": int}
-    if not isinstance(state, dict) or not all(isinstance(state.get(k), v) for k, v in shape.items()):
-        raise _no_checkpoint(path, "it has no pipeline and step")
-    tensors = {name: value for name, value in state["pipeline"].items() if isinstance(value, Tensor)}
-    for name, value in tensors.items():
-        if value.layout != torch.strided:
-            raise _no_checkpoint(path, f"{name} is a sparse tensor")
-        if value.nbytes > value.untyped_storage().nbytes():
-            raise _no_checkpoint(path, f"{name} is larger than what is stored of it")
-        if name.endswith(".means") and not value.isfinite().any():
-            raise _no_checkpoint(path, "no Gaussian has a position that is a number")
-    return state
-
-
-def _no_checkpoint(path: Path, why: object) -> UserError:
-    return UserError(
-        f"{path} is not a checkpoint of lang3dxl ({why}); nothing in it was run. Pass a run's "
-        "config.yml, in --load-dir its folder nerfstudio_models, in --load-checkpoint one of its step-….ckpt "
-        "files"
+    remedy = (
+        "nothing in it was run. Pass a run's config.yml, in --load-dir its folder nerfstudio_models, in "
+        "--load-checkpoint one of its step-….ckpt files"
     )
+    with readable(f"{path} is not a checkpoint of lang3dxl", remedy, NOT_A_CHECKPOINT):
+        return load_checked(path, "pipeline")
 
 
 def check_checkpoint(place: Path) -> None:

@@ -25,7 +25,7 @@ from torch.cuda.amp.grad_scaler import GradScaler
 
 from lang3dxl_ns.common.console import say, some
 from lang3dxl_ns.common.device import multiplies_bfloat16
-from lang3dxl_ns.common.errors import UserError, not_of_memory
+from lang3dxl_ns.common.errors import UserError, readable
 from lang3dxl_ns.common.files import expanded
 from lang3dxl_ns.common.memory import ran_out_of_memory
 from lang3dxl_ns.common.options import data_option
@@ -34,11 +34,11 @@ from lang3dxl_ns.common.stopping import stoppable
 from lang3dxl_ns.files.scene_file import SUFFIX, Provenance, replace_scene
 from lang3dxl_ns.plugin.optimizers import GuardedOptimizers
 from lang3dxl_ns.plugin.pipeline import Lang3DXLPipeline, Lang3DXLPipelineConfig
-from lang3dxl_ns.plugin.run_checkpoint import NOT_A_CHECKPOINT, check_checkpoint, read_checkpoint
+from lang3dxl_ns.plugin.run_checkpoint import check_checkpoint, read_checkpoint
 from lang3dxl_ns.preparation.needs import NEEDS_FILE, write_needs
 from lang3dxl_ns.preparation.store import PhotosGoneError
 from lang3dxl_ns.scene.record import SCENE_FILE, SceneRecord
-from lang3dxl_ns.training.checkpoint import save_checkpoint
+from lang3dxl_ns.training.checkpoint import NOT_A_CHECKPOINT, save_checkpoint
 from lang3dxl_ns.training.estimate import estimate
 from lang3dxl_ns.training.learn_codes import forget_words
 from lang3dxl_ns.training.learning_rates import add_rows_to_state
@@ -187,7 +187,8 @@ class Lang3DXLTrainer(Trainer):
         if (before := path.parent.with_name(SCENE_FILE)).is_file():
             corrected = any(name.endswith("pose_adjustment") for name in state["pipeline"])
             self._check_photos(path, SceneRecord.read(before), corrected)
-        try:
+        remedy = "give --load-dir a run's folder nerfstudio_models, or --load-checkpoint one of its files"
+        with readable(f"{path} is not a checkpoint of lang3dxl", remedy, NOT_A_CHECKPOINT):
             self._start_step = state["step"] + 1
             self.pipeline.load_pipeline(state["pipeline"], state["step"])
             if left_out := sorted(set(state["optimizers"]) - set(self.optimizers.optimizers)):
@@ -201,12 +202,6 @@ class Lang3DXLTrainer(Trainer):
             if state["scalers"]:  # a run without a loss scale has none
                 self.grad_scaler.load_state_dict(state["scalers"])
             self._run_state, self.words_are_learned = state["run"], state["words"]
-        except NOT_A_CHECKPOINT as error:
-            not_of_memory(error)
-            raise UserError(
-                f"{path} is not a checkpoint of lang3dxl ({error}): give --load-dir the "
-                "nerfstudio_models folder of a run, or --load-checkpoint one of its step-….ckpt files"
-            ) from error
         CONSOLE.log(f"Loaded {path}")
 
     def _check_photos(self, path: Path, before: SceneRecord, corrected: bool) -> None:
@@ -384,9 +379,7 @@ class Lang3DXLTrainer(Trainer):
         path = self.base_dir / f"{data.capture.folder.name or 'scene'}{SUFFIX}"
         config, place = model.config, self.config.load_checkpoint
         how = f"{self.config.method_name}, {config.decoder.name}, {config.total_steps} iterations"
-        with torch.no_grad():
-            poses = torch.stack([model.run.pose(view) for view in data.cameras]).cpu()
-        file = data.record(poses)
+        file = data.record(model.run)
         file.write(self.base_dir / SCENE_FILE)
         scene = model.scene(file)
         checkpoints = self.config.load_dir or (place and place.parent)

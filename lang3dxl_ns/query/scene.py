@@ -460,9 +460,9 @@ class Scene:
         words = shipped_vocabulary() if words is None else texts_of(words, "a word")
         return answer.words_at(self, self.camera(place, size), x, y, words, most)
 
-    def things(self, texts: str | Sequence[str]) -> list[Things]:
-        """Find the single things that each prompt names: windows, portals, towers. See `things_of`."""
-        return things_of(self, texts)
+    def things(self, texts: Text | Sequence[Text]) -> list[Things]:
+        """Find the single things that each prompt of `texts` (see `ask`) names: windows, portals, towers."""
+        return things_of(self, self.ask(texts))
 
     # ── words taught by example ─────────────────────────────────────────────────────────────────────
 

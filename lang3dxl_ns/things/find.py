@@ -14,6 +14,7 @@ from torch import Tensor
 
 from lang3dxl_ns.query.answering import Answering
 from lang3dxl_ns.query.doubt import doubtful, peaks
+from lang3dxl_ns.query.question import Question
 from lang3dxl_ns.rendering import composite
 from lang3dxl_ns.things.join import VIEWS, Joined, join, stacked, without_crumbs
 from lang3dxl_ns.things.pieces import FILLED, LEVELS, Piece, Shown, pieces_of
@@ -21,6 +22,8 @@ from lang3dxl_ns.things.thing import Box, Sighting, Thing, upright_box
 
 COLORED = 20
 """Number of Gaussians within and around the matches below which colors tell nothing."""
+SAMPLED = 50_000
+"""Number of Gaussians, each of matches and of others, from which only every second one tells colors."""
 _KNOWN: WeakKeyDictionary[Answering, list[Thing]] = WeakKeyDictionary()
 """Things that were found in each scene so far: they keep their ids."""
 SAME = 0.5
@@ -61,17 +64,14 @@ class Things:
         return sure if self.least == self.most else f"{sure}, perhaps {self.least} to {self.most}"
 
 
-def things_of(scene: Answering, texts: str | Sequence[str]) -> list[Things]:
-    """Find the single things that each prompt of `texts` names.
+def things_of(scene: Answering, question: Question) -> list[Things]:
+    """Find the single things that each prompt of a question to the scene names.
 
     Every training view's heat map falls into pieces (`pieces_of`), and pieces of several views are one thing
     where they share Gaussians (`join`). Where a prompt's colors differ from those around it, colors separate
     neighbors: the wall between two windows that CLIP sees as one. A thing that an earlier question to this
     scene found keeps its id.
-
-    Raises UserError as `Scene.ask` does.
     """
-    question = scene.ask(texts)
     mass = scene.mass.double().cpu().numpy()
     means, up = scene.splats.means.double().cpu().numpy(), up_of(scene)
     sharp = [_sharpened(scene, relevancy) for relevancy in question.relevancy]
@@ -118,11 +118,12 @@ def _sharpened(scene: Answering, relevancy: Float[Tensor, " n"]) -> Float[Tensor
 
     means, colors = scene.splats.means.cpu().numpy(), scene.splats.harmonics[:, 0].cpu().numpy()
     values, mass = relevancy.cpu().numpy(), scene.mass.cpu().numpy()
-    match = np.flatnonzero((values > 0.9) & (mass > 0))
+    sides = (np.flatnonzero(side & (mass > 0)) for side in (values > 0.9, values < 0.5))
+    match, around = (rows[:: 1 + len(rows) // SAMPLED] for rows in sides)
     if len(match) < COLORED:
         return relevancy
-    near = np.isfinite(KDTree(means[match]).query(means, distance_upper_bound=scene.gap)[0])
-    around = np.flatnonzero((values < 0.5) & near & (mass > 0))
+    distance, _ = KDTree(means[match]).query(means[around], distance_upper_bound=scene.gap)
+    around = around[np.isfinite(distance)]
     if len(around) < COLORED:
         return relevancy
     rows = np.concatenate([match, around])

@@ -1,8 +1,4 @@
-"""Questions about things: counts, superlatives, ordinals and relations, from one table (`grammar.json`).
-
-Up is the cameras'. Left and right are those of the given view, or else of someone who faces the things that
-the question is about: of the photo that shows them best.
-"""
+"""Questions about things: counts, superlatives, ordinals and relations, from one table (`grammar.json`)."""
 
 from __future__ import annotations
 

@@ -6,6 +6,7 @@ import csv
 import io
 import json
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -37,15 +38,21 @@ def write_catalog(scene: Scene, answers: Sequence[Things], folder: Path) -> None
     words = [{"word": one.word, "count": len(one.things), "least": one.least, "most": one.most,
               "caution": one.caution, "things": [thing.id for thing in one.things]}
              for one in answers]  # fmt: skip
-    content = {"words": words, "things": [t.as_json() for t in things], "relations": graph, "up": up.tolist()}
+    place = scene.file.georeference
+    meters = [None if place is None else (place.meters * t.size).round(2).tolist() for t in things]
+    listed = [t.as_json() | {"meters": size} for t, size in zip(things, meters, strict=True)]
+    content = {"words": words, "things": listed, "relations": graph, "up": up.tolist()}
+    content["unit"] = None if place is None else asdict(place)
     write_atomically(folder / "things.json", json.dumps(content, indent=1) + "\n")
     rows = io.StringIO()
     table = csv.writer(rows, lineterminator="\n")
-    table.writerow(["id", "word", "score", "views", "x", "y", "z", "width", "depth", "height", "photo"])
-    for thing in things:
+    sides = ["width", "depth", "height"]
+    named = ["id", "word", "score", "views", "x", "y", "z", *sides, "photo", *(f"{side}_m" for side in sides)]
+    table.writerow(named)
+    for thing, size in zip(things, meters, strict=True):
         seen = thing.sightings[0].photo if thing.sightings else ""
-        numbers = [*thing.center.round(4).tolist(), *thing.size.round(4).tolist()]
-        table.writerow([thing.id, thing.word, round(thing.score, 3), thing.views, *numbers, seen])
+        numbers = [*thing.center.round(4).tolist(), *thing.size.round(4).tolist(), seen, *(size or [""] * 3)]
+        table.writerow([thing.id, thing.word, round(thing.score, 3), thing.views, *numbers])
     write_atomically(folder / "things.csv", rows.getvalue())
     write_atomically(folder / "instances.json", json.dumps(coco(scene, answers)) + "\n")
 

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any, Literal, cast
 
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
 from lang3dxl_ns.common.console import say
@@ -34,7 +33,7 @@ from lang3dxl_ns.scene.capture import Capture
 from lang3dxl_ns.scene.photo import Photo
 from lang3dxl_ns.scene.reconstruction import doubtful_photos
 from lang3dxl_ns.scene.record import ScenePhoto, SceneRecord
-from lang3dxl_ns.training.state import PhotoCamera
+from lang3dxl_ns.training.state import PhotoCamera, Training
 
 IN_A_STEP = {"clip_target": torch.float32, "dense_target": torch.float32, "regions": torch.int64}
 """Number types of targets in a step; in memory they are kept half as wide."""
@@ -206,17 +205,16 @@ class TrainingData:
                 facts.dense_targets = partial(self.targets.dense_features, usable)
         return facts
 
-    def record(self, poses: Float[Tensor, "n 3 4"] | None = None) -> SceneRecord:
-        """Describe photos, cameras and CLIP for a scene file. `poses`: those of the training photos (default:
-        unrefined)."""
+    def record(self, run: Training | None = None) -> SceneRecord:
+        """Describe photos, CLIP and cameras, as the run refined them, for a scene file."""
         known = None if self.config.clip == "none" else find_model(self.config.clip, CLIP_OPTION)
-        train, frame = self.capture.split.train, self.capture.recorded_frame
         described, doubts = [], doubtful_photos(self.cache_dir)
-        for i, (name, view) in enumerate(self.views.items()):
-            pose = view.pose if poses is None or i >= len(train) else poses[i]
-            split: Literal["train", "eval"] = "train" if i < len(train) else "eval"
+        for name, view in self.views.items():
+            pose = view.pose if run is None else run.pose(view)
+            split: Literal["train", "eval"] = "eval" if view.photo is None else "train"
             doubt = doubts.get(name)
             described.append(ScenePhoto.of(self.photos[name], split, pose.tolist(), self.scale, doubt))
+        frame = self.capture.recorded_frame
         return SceneRecord(
             photos=described,
             clip=None if known is None else known.address,

@@ -4,18 +4,22 @@ from __future__ import annotations
 
 import pickle
 from collections.abc import Mapping
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from pathlib import Path
 from shutil import disk_usage
 from typing import Any
 
 import torch
+from torch import Tensor
 
-from lang3dxl_ns.common.errors import DAMAGE, UserError
+from lang3dxl_ns.common.checks import expect
+from lang3dxl_ns.common.errors import DAMAGE, UserError, readable
 from lang3dxl_ns.common.files import check_regular, replace_durably
 
 CHECKPOINT = "training.ckpt"
 """Name of the checkpoint in a run's folder."""
+NOT_A_CHECKPOINT = (*DAMAGE, pickle.UnpicklingError)
+"""Exceptions raised when a file that is not a checkpoint is read."""
 
 
 def save_checkpoint(path: Path, content: Mapping[str, Any], partial: Path | None = None) -> None:
@@ -36,20 +40,39 @@ def save_checkpoint(path: Path, content: Mapping[str, Any], partial: Path | None
         ) from error
 
 
+def load_checked(path: Path, tensors: str) -> dict[str, Any]:
+    """Read a checkpoint's content on the CPU, without executing code. `tensors` is the name of the part that
+    has the model's. Raises one of `NOT_A_CHECKPOINT` for a damaged or another file."""
+    check_regular(path)
+    state = torch.load(path, map_location="cpu", weights_only=True)
+    parts = {tensors: dict, "step": int}
+    known = isinstance(state, dict) and all(isinstance(state.get(k), kind) for k, kind in parts.items())
+    expect(known, f"it has no {tensors} and step")
+    for name, value in state[tensors].items():
+        if isinstance(value, Tensor):
+            expect(value.layout == torch.strided, f"{name} is a sparse tensor")
+            stored = value.untyped_storage().nbytes()
+            expect(value.nbytes <= stored, f"{name} is larger than what is stored of it")
+            sound = not name.endswith(".means") or bool(value.isfinite().any())
+            expect(sound, "no Gaussian has a position that is a number")
+    return state
+
+
+def as_damage(path: Path) -> AbstractContextManager[None]:
+    """Turn errors of a damaged checkpoint of `fit` into a UserError."""
+    remedy = "restore it, or delete it to train anew (targets are kept)"
+    return readable(f"{path} can't be read", remedy, NOT_A_CHECKPOINT)
+
+
 def read_checkpoint(path: Path, about: Mapping[str, Any]) -> dict[str, Any] | None:
     """Read a run's checkpoint on the CPU; None if there is none. `about` describes the present run. Raises
     UserError if the file is damaged, or its run had another description."""
     if not path.exists():
         return None
-    try:
-        check_regular(path)
-        content = torch.load(path, map_location="cpu", weights_only=True)
-        before = content["about"]
-    except (*DAMAGE, pickle.UnpicklingError) as error:
-        raise UserError(
-            f"{path} can't be read ({error}): restore it, or delete it to train anew (targets are kept)"
-        ) from error
-    if changed := [name for name in about if about[name] != before.get(name)]:
+    with as_damage(path):
+        content = load_checked(path, "tensors")
+        changed = [name for name in about if about[name] != content["about"].get(name)]
+    if changed:
         raise UserError(
             f"{path.parent} holds a run with another {' and '.join(changed)}: give its options to go on, "
             "another --out, or --restart to train anew"

@@ -28,7 +28,7 @@ from lang3dxl_ns.scene.capture import Capture, open_capture, say_left_out
 from lang3dxl_ns.scene.companions import cache_folder
 from lang3dxl_ns.scene.photo_folder import check_data
 from lang3dxl_ns.training.batches import TrainingData, settle
-from lang3dxl_ns.training.checkpoint import CHECKPOINT, read_checkpoint, save_checkpoint
+from lang3dxl_ns.training.checkpoint import CHECKPOINT, as_damage, read_checkpoint, save_checkpoint
 from lang3dxl_ns.training.estimate import check_device, estimate
 from lang3dxl_ns.training.learn_codes import forget_words, learn_words
 from lang3dxl_ns.training.learning_rates import Rates, learning_rates, printed_learning_rates
@@ -160,8 +160,7 @@ class Run:
 
     def scene(self) -> Scene:
         """Return the scene so far, which later training doesn't change."""
-        poses = torch.stack([self.state.pose(view) for view in self.data.cameras]).detach().cpu()
-        return snapshot(self.state, self.data.record(poses))
+        return snapshot(self.state, self.data.record(self.state))
 
     def save(self, step: int) -> Scene:
         """Write the checkpoint after an iteration, and the scene so far."""
@@ -180,17 +179,18 @@ class Run:
 
     def resume(self) -> None:
         """Go on where the folder's checkpoint ends, if there is one."""
-        saved = read_checkpoint(self.folder / CHECKPOINT, self.about)
-        if saved is None:
+        path = self.folder / CHECKPOINT
+        if (saved := read_checkpoint(path, self.about)) is None:
             return
-        self.start, self.words_are_learned = saved["step"] + 1, saved["words"]
-        self.state.load(saved["tensors"])
-        for name, content in saved["optimizers"].items():
-            self.optimizers[name].load_state_dict(content)
-        for name, content in saved["schedulers"].items():
-            self.schedulers[name].load_state_dict(content)
-        self.data.restore(saved["run"]["photos"])
-        self.state.restore(saved["run"])
+        with as_damage(path):
+            self.start, self.words_are_learned = saved["step"] + 1, saved["words"]
+            self.state.load(saved["tensors"])
+            for name, content in saved["optimizers"].items():
+                self.optimizers[name].load_state_dict(content)
+            for name, content in saved["schedulers"].items():
+                self.schedulers[name].load_state_dict(content)
+            self.data.restore(saved["run"]["photos"])
+            self.state.restore(saved["run"])
         self.state.step = saved["step"]
         if self.start < self.settings.steps:
             forget_words(self.state)

@@ -329,6 +329,15 @@ async function outline(prompt) {
   if (found) await attempt(() => addMark(prompt, inside(found), prompt.without, found));
 }
 
+const post = (path, content) => fetch(path, { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(content) });
+
+/** Keep the tour in the address and, behind a live page, in the scene's file. */
+async function keepTour() {
+  keepAddress();
+  const answered = about.live && (await post("api/tour", { tour: written({ prompts: [], stops: tour.fields }) }));
+  if (answered && !answered.ok) say(`The scene does not keep the tour: ${await answered.text()}`);
+}
+
 /** Teach a named word to the scene behind a live page, which answers it from then on. */
 async function teachScene(prompt, before = prompt.text) {
   const marks = about.live && prompt.named ? asPython(prompt.examples, about.cameras) : [];
@@ -336,7 +345,7 @@ async function teachScene(prompt, before = prompt.text) {
     if (prompt.named && !about.live) tellCard(prompt, "This browser keeps it. Save writes a file for lang3dxl words --load, which learns it from the photos.");
     return;
   }
-  const answered = await postWord({ name: prompt.text, before, examples: marks });
+  const answered = await post("api/teach", { name: prompt.text, before, examples: marks });
   if (!answered.ok) return tellCard(prompt, `The scene did not learn it: ${await answered.text()}`);
   taughtHere.add(prompt.text);
   await think("forget", { texts: [prompt.text, before] });
@@ -345,8 +354,6 @@ async function teachScene(prompt, before = prompt.text) {
   prompt.told = (await answered.json()).told;
   draw();
 }
-
-const postWord = (word) => fetch("api/teach", { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(word) });
 
 function tellCard(prompt, told) {
   prompt.told = told;
@@ -362,7 +369,7 @@ async function forget(prompt) {
   kept.store("words", kept.list("words").filter(({ name }) => name !== prompt.text));
   remove(prompt);
   if (!taughtHere.delete(prompt.text)) return;
-  await postWord({ name: prompt.text, before: prompt.text, examples: [] });
+  await post("api/teach", { name: prompt.text, before: prompt.text, examples: [] });
   await think("forget", { texts: [prompt.text] });
 }
 
@@ -615,7 +622,7 @@ async function open() {
   list = new List(about, think, view, prompts);
   photos = new Photos(about, view, (name) => attempt(() => light(name === null ? chosenLook : name in about.looks ? name : chosenLook)));
   photos.changed = () => keepAddress();
-  tour = new Tour(() => shownNow([]), (hash) => attempt(() => apply(hash, drop(), true)), () => keepAddress());
+  tour = new Tour(() => shownNow([]), (hash) => attempt(() => apply(hash, drop(), true)), () => attempt(keepTour));
   steps = new Steps((hash) => attempt(() => apply(hash)), () => {
     $("undo").disabled = !steps.past;
     $("redo").disabled = !steps.future;
@@ -647,9 +654,12 @@ async function begin() {
   if (about.words) setTimeout(() => think("space").then((space) => (view.mover.space = space))); // behind the prompts
   setTimeout(() => attempt(readFloaters));
   if (about.detail) new Detail(about, view, think, { read: fetched, question, failed: (error) => say(error.message) });
-  if (location.hash.length > 1) return apply(location.hash, turn);
-  for (const [text, ...negatives] of about.prompts) if (turn === cleared) await ask(asTyped({ text, negatives }), turn);
-  if (turn === cleared) settle("");
+  const { stops, play } = readFields(location.hash);
+  if (location.hash.length > 1) await apply(location.hash, turn);
+  else for (const [text, ...negatives] of about.prompts) if (turn === cleared) await ask(asTyped({ text, negatives }), turn);
+  if (!stops.length) tour.fields = readFields(about.tour).stops;
+  if (location.hash.length <= 1 && turn === cleared) settle("");
+  if (play) tour.play();
 }
 
 const drawing = open(), reading = drawing.then(readMeaning);

@@ -104,21 +104,23 @@ class Handler(BaseHTTPRequestHandler):
         self._answer(lambda: self.server.answer(self.path))
 
     def do_POST(self) -> None:
-        """Teach the scene a word, for a page of this server that may be used."""
-        self._answer(self._teach)
+        """Teach the scene a word, or keep a tour, for a page of this server that may be used."""
+        self._answer(self._keep)
 
-    def _teach(self) -> tuple[HTTPStatus, str, bytes]:
+    def _keep(self) -> tuple[HTTPStatus, str, bytes]:
         size = int(self.headers.get("Content-Length") or 0)
         # Browsers name the origin of every POST; other sites can't send JSON without asking first.
         ours = self.headers.get("Origin") and self.headers.get("Content-Type") == _KINDS["json"]
-        if urlsplit(self.path).path != "/api/teach" or not ours or not 0 < size <= _MOST_MARKS:
+        page, path = self.server.page, urlsplit(self.path).path
+        keep = {"/api/teach": page.teach, "/api/tour": page.own_words.keep_tour}.get(path)
+        if keep is None or not ours or not 0 < size <= _MOST_MARKS:
             self.close_connection = True  # what was sent is not read
             raise UserError("this server takes the marks of a word from its own page alone")
         try:
             content = json.loads(self.rfile.read(size))
         except RecursionError as error:
             raise UserError("these are no marks of a word: load the page again") from error
-        return HTTPStatus.OK, _KINDS["json"], json.dumps(self.server.page.teach(content)).encode()
+        return HTTPStatus.OK, _KINDS["json"], json.dumps(keep(content)).encode()
 
     def _answer(self, answer: Callable[[], tuple[HTTPStatus, str, bytes]]) -> None:
         refused = self.server.access.refusal(self.path, self.headers)

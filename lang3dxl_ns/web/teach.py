@@ -28,15 +28,10 @@ class PageWords:
     def teach(self, scene: Scene, content: Mapping[str, Any]) -> tuple[Scene, str]:
         """Teach a word from a page's marks; return the scene with it, and a sentence for the page.
 
-        Args:
-            scene: the scene as it is.
-            content: the word's `name`, the name that it had `before`, and all `examples` marked in pages, as
-                `Example.to_json` writes them. They replace what pages sent earlier; examples that were
-                taught otherwise stay. None forgets what pages taught.
-
-        Raises:
-            UserError: the content is not of this form, or see `Scene.teach`.
-        """
+        content: the word's `name`, the name that it had `before`, and all `examples` marked in pages, as
+        `Example.to_json` writes them. They replace what pages sent earlier; examples that were taught
+        otherwise stay. No example forgets what pages taught. Raises UserError if the content is not of this
+        form, or see `Scene.teach`."""
         try:
             name, before = str(content["name"]), str(content["before"])
             examples = [Example.from_json(example) for example in content["examples"]]
@@ -53,6 +48,14 @@ class PageWords:
                     self.file, {word: new for word, new in changed.items() if new is not known.get(word)}
                 )
         return scene, told
+
+    def keep_tour(self, content: Mapping[str, Any]) -> None:
+        """Keep a page's tour in the scene file, if there is one. Raises UserError for other content."""
+        if not isinstance(content, dict) or not isinstance(tour := content.get("tour"), str):
+            raise UserError("this is no tour: load the page again")
+        if self.file is not None:
+            with self._one, locked(self.file.resolve().parent):
+                keep_words(self.file, {}, tour)
 
     def _taught(self, scene: Scene, name: str, before: str, examples: Sequence[Example]) -> tuple[Scene, str]:
         for former in {known_word(before), known_word(name)}:

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -142,7 +141,6 @@ class Page:
         files["language.js"] = language_module()
         files["spark.bin"] = gzip.compress(_LIBRARY.read_bytes(), mtime=0)
         files["splats.bin"] = pack_splats(scene.baked(self.look), center, self._toward).tobytes()
-        up = np.mean([photo.pose[:3, 1] for photo in scene.photos], axis=0)
         told = self.provenance
         about: dict[str, Any] = {
             "title": told.title or Path(scene.file.data).name,
@@ -151,7 +149,8 @@ class Page:
             "center": center.tolist(),
             "antialiased": scene.splats.antialiased,
             "background": [0, 0, 0] if scene.background is None else scene.background.tolist(),
-            "up": (up / max(float(np.linalg.norm(up)), 1e-9)).tolist(),
+            "up": find.up_of(scene).tolist(),
+            "tour": told.tour,
             "meters": None if scene.file.georeference is None else asdict(scene.file.georeference),
             "start": camera_json(scene.overview.full_camera),
             "colors": PROMPT_COLORS,

@@ -21,6 +21,8 @@ from lang3dxl_ns.plugin.panel import INVITATION, stand_of
 from lang3dxl_ns.plugin.pipeline import QUERY_VARIABLE
 from lang3dxl_ns.query.question import QueryConfig
 from lang3dxl_ns.scene.record import overview
+from lang3dxl_ns.things.find import Things
+from lang3dxl_ns.things.thing import Sighting, Thing
 
 
 @pytest.fixture(scope="module")
@@ -164,6 +166,33 @@ def test_flying_leads_through_the_best_views_of_all_prompts(panel):
         np.testing.assert_allclose(client.camera.look_at, goal[1] * 10)
         assert found.views[view].name.split(".")[0] in panel._message.content.replace("\\", "")
     assert seen == [("dome", 0), ("door", 0), ("dome", 1)]
+
+
+def test_single_things_are_counted_and_each_can_be_flown_to(panel, monkeypatch):
+    type_in(panel, "dome")
+    photo = panel._photos[1]
+    seen = [Sighting(photo.name, (0, 0, 4, 4))]
+    things = [Thing(n, "dome", 1.0, 9, np.full(3, n), np.eye(3), np.ones(3), np.array([n]), seen)
+              for n in range(2)]  # fmt: skip
+    monkeypatch.setattr(panel.conversation, "things", lambda: [Things("dome", things, things[:1])])
+    assert panel._count.visible and not panel._listed.visible
+    panel._finder.submit(panel._list)
+    assert idle(panel._finder)
+    assert "2, perhaps 2 to 3 found" in panel._message.content
+    assert panel._listed.visible and list(panel._listed.options)[1:] == ["dome 1", "dome 2"]
+    client = Client()
+    panel._listed.value = "dome 2"
+    panel._fly_to(client)
+    goal = stand_of(panel._pipeline.scene_file.photo(photo.name).camera, client.camera.aspect, (1.0,) * 3)
+    np.testing.assert_allclose(client.camera.look_at, goal[1] * 10)
+    type_in(panel, "door")
+    assert not panel._listed.visible
+    panel._fly_to(client)  # the list of the question before is gone
+
+
+def test_the_conversation_finds_the_things_of_its_question(panel):
+    type_in(panel, "dome; door")
+    assert [one.word for one in panel.conversation.things()] == ["dome", "door"]
 
 
 def test_a_page_opens_at_the_overview_and_no_photo_is_in_its_way(panel, viewer):

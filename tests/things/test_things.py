@@ -1,16 +1,19 @@
 """Laws of things: pieces, joining, boxes and questions, on scenes that are drawn by hand."""
 
+import csv
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from painted_scene import painted_scene
+from painted_scene import painted_file, painted_scene
 
 from lab.benchmarks.questions import Known, ask_all
 from lab.landmark.instances import true_things
 from lab.landmark.landmark import Landmark
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.things.find import Things, things_of, up_of
+from lang3dxl_ns.scene.georeference import Georeference
+from lang3dxl_ns.things.find import Things, up_of
 from lang3dxl_ns.things.grammar import Request, Sight, answer, parse, sight_of, table, unsure
 from lang3dxl_ns.things.join import OFTEN, Joined, join, stacked, without_crumbs
 from lang3dxl_ns.things.pieces import Piece, Shown, pieces_of, split
@@ -170,11 +173,18 @@ def test_true_things_hold_each_solid_once(family, seed):
 
 def test_a_thing_keeps_its_id_in_later_questions_and_under_other_words():
     scene = painted_scene()
-    (first,), (again, _) = things_of(scene, "windows"), things_of(scene, ["window", "dome"])
+    (first,), (again, _) = scene.things("windows"), scene.things(["window", "dome"])
     assert len(first.things) == 2
     assert {one.id for one in first.things} == {one.id for one in again.things}
-    (alone,) = things_of(painted_scene(), "window")
+    (alone,) = painted_scene().things("window")
     assert {one.id for one in alone.things} == {one.id for one in first.things}
+
+
+def test_a_sample_of_the_gaussians_tells_the_colors_of_a_word(monkeypatch):
+    every = painted_scene().things("windows")[0].things
+    monkeypatch.setattr("lang3dxl_ns.things.find.SAMPLED", 100)
+    some = painted_scene().things("windows")[0].things
+    assert [one.id for one in some] == [one.id for one in every]
 
 
 def test_the_catalog_names_the_nearest_neighbors_and_what_is_in_what(tmp_path):
@@ -190,6 +200,20 @@ def test_the_catalog_names_the_nearest_neighbors_and_what_is_in_what(tmp_path):
     assert [1, other, 0] in graph
     assert [0, side, 2] not in graph  # the one between is nearer
     assert [1, side, 2] in graph
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_the_catalog_has_meters_where_the_scene_has_them(known, tmp_path):
+    place = Georeference(2.5, (0.0, -1.0, 0.0), (0.0, 0.0, 1.0), 0.05, 7) if known else None
+    scene = painted_scene(file=replace(painted_file(), georeference=place))
+    one = thing(3, "window", (0, 0, 0), (1, 2, 4))
+    write_catalog(scene, [Things("window", [one], [])], tmp_path)
+    catalog = json.loads((tmp_path / "things.json").read_text())
+    assert catalog["things"][0]["meters"] == ([2.5, 5.0, 10.0] if known else None)
+    assert (catalog["unit"] or {}).get("meters") == (2.5 if known else None)
+    with (tmp_path / "things.csv").open() as file:
+        (row,) = csv.DictReader(file)
+    assert [row["height"], row["height_m"]] == ["4.0", "10.0" if known else ""]
 
 
 def test_generated_questions_are_right_where_all_is_found_and_tell_what_is_missed():

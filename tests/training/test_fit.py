@@ -159,3 +159,50 @@ def test_mixed_precision_without_such_a_gpu_is_refused_before_anything_is_prepar
     with pytest.raises(UserError, match="--mixed-precision needs a GPU"):
         begin(open_capture(data), made, tmp_path / "run", tmp_path / "cache", "cpu")
     assert not list(tmp_path.iterdir())
+
+
+def without(*places: str):
+    """A change to a checkpoint's content that drops what a path of names leads to."""
+
+    def change(content: dict) -> None:
+        for name in places[:-1]:
+            content = content[name]
+        del content[places[-1]]
+
+    return change
+
+
+DAMAGES = {
+    "no step": without("step"),
+    "no positions": without("tensors", "gauss_params.means"),
+    "no moments": without("optimizers", "means", "state"),
+    "no generator": without("run", "random"),
+    "larger than stored": lambda content: content["tensors"].update(
+        {"gauss_params.means": torch.zeros(1, 1).expand(9, 3)}
+    ),
+    "no description": lambda content: content.update(about=None),
+}
+
+
+def test_a_damaged_checkpoint_is_named_with_what_helps_and_a_full_memory_is_no_damage(
+    data, settings, tmp_path, monkeypatch
+):
+    cache, capture = data / "lang3dxl_cache", open_capture(data)
+    fit(capture, settings(2), tmp_path, cache, "cpu")
+    whole = (tmp_path / CHECKPOINT).read_bytes()
+    for kind, damage in DAMAGES.items():
+        (tmp_path / CHECKPOINT).write_bytes(whole)
+        content = torch.load(tmp_path / CHECKPOINT, weights_only=True)
+        damage(content)
+        torch.save(content, tmp_path / CHECKPOINT)
+        with pytest.raises(UserError) as error:
+            begin(capture, settings(2), tmp_path, cache, "cpu")
+        told = r"training\.ckpt can't be read .*: restore it, or delete it"
+        assert re.search(told, str(error.value)), f"{kind}: {error.value}"
+
+    def full(*_, **__):
+        raise RuntimeError("[enforce fail] DefaultCPUAllocator: can't allocate memory")
+
+    monkeypatch.setattr(torch, "load", full)
+    with pytest.raises(RuntimeError, match="allocate"):
+        begin(capture, settings(2), tmp_path, cache, "cpu")

@@ -1,10 +1,22 @@
 """A tour on the page: kept views with words and captions, in the link, played in order."""
 
+import json
+
 import pytest
 from pages import DESK, browser, served, until
 from painted_scene import painted_scene
+from test_live_page import file, live
 from test_visits import visit
 
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.files.scene_file import (
+    Provenance,
+    describe_scene_file,
+    keep_words,
+    read_scene,
+    replace_scene,
+)
+from lang3dxl_ns.web.teach import PageWords
 from lang3dxl_ns.web.write_page import Page, write_page
 
 STOPS = [("the dome & its cross; “high”", "dome"), ("", "windows")]
@@ -67,3 +79,30 @@ def test_a_damaged_tour_opens_and_plays(browser, address, hostile):
     with visit(browser, f"{address}#{hostile}", DESK) as page:
         page.evaluate("lang3dxl.tour.play(1)")
         assert not page.evaluate("document.querySelector('#stops b, #caption b')")
+
+
+def test_a_tour_is_kept_in_the_scenes_file_and_plays_from_there(browser, file, tmp_path):
+    with live(file) as server, visit(browser, server.access.address, DESK) as page:
+        page.evaluate("document.getElementById('tour').open = true")
+        page.evaluate("lang3dxl.ask('dome').then(() => true)")
+        with page.expect_response("**/api/tour"):
+            page.click("#keep")
+        with page.expect_response("**/api/tour"):
+            page.keyboard.type("High")
+            page.keyboard.press("Tab")
+    tour = describe_scene_file(file)["provenance"].tour
+    assert tour.count("stop=") == 1 and "caption%3DHigh" in tour and "dome" in tour
+    keep_words(file, {})  # what teaches a word keeps the tour
+    replaced, _ = replace_scene(file, read_scene(file, "cpu"), Provenance())
+    told = describe_scene_file(file)["provenance"]
+    assert told.tour == tour
+    write_page(Page(replaced, provenance=told), tmp_path / "page")
+    with served(tmp_path / "page") as address, visit(browser, f"{address}#play=1", DESK) as page:
+        page.wait_for_function("document.getElementById('caption').textContent === 'High'")
+        page.wait_for_function("lang3dxl.prompts.some(({ text }) => text === 'dome')")
+
+
+@pytest.mark.parametrize("content", ["[]", "{}", '{"tour": 3}', "null"])
+def test_what_is_no_tour_is_not_kept(content):
+    with pytest.raises(UserError, match="no tour"):
+        PageWords().keep_tour(json.loads(content))
