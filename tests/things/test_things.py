@@ -13,7 +13,7 @@ from lab.landmark.instances import true_things
 from lab.landmark.landmark import Landmark
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.scene.georeference import Georeference
-from lang3dxl_ns.things.find import Things, things_of, up_of
+from lang3dxl_ns.things.find import Things, up_of
 from lang3dxl_ns.things.grammar import Request, Sight, answer, parse, sight_of, table, unsure
 from lang3dxl_ns.things.join import OFTEN, Joined, join, stacked, without_crumbs
 from lang3dxl_ns.things.pieces import Piece, Shown, pieces_of, split
