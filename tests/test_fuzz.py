@@ -15,21 +15,26 @@ from hypothesis import strategies as st
 from PIL import Image
 from scenes import write_scene
 
+from lang3dxl_ns.commands.evaluate import EvaluatePool
 from lang3dxl_ns.common import presets
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.pictures import FORMATS
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth
+from lang3dxl_ns.evaluation.layouts import read_lerf_ovs
 from lang3dxl_ns.methods import lang3dxl
 from lang3dxl_ns.plugin.run_checkpoint import check_checkpoint, read_checkpoint
 from lang3dxl_ns.plugin.trainer_config import read_config
+from lang3dxl_ns.preparation.needs import read_needs
 from lang3dxl_ns.preparation.regions import FolderRegions
 from lang3dxl_ns.preparation.store import FeatureStore
+from lang3dxl_ns.query.vocabulary import whole_words
 from lang3dxl_ns.scene.camera import Lens
 from lang3dxl_ns.scene.camera_path import read_camera_path
 from lang3dxl_ns.scene.colmap import read_reconstruction
 from lang3dxl_ns.scene.companions import companion, inside
 from lang3dxl_ns.scene.photo import Photo
 from lang3dxl_ns.scene.record import ScenePhoto, SceneRecord
+from lang3dxl_ns.words.taught_words import load_words
 
 INPUTS = int(os.environ.get("LANG3DXL_FUZZ", "60"))
 """Inputs per reader."""
@@ -258,6 +263,61 @@ def test_configs(settings_of_a_run, tmp_path, data):
     (tmp_path / "config.yml").write_bytes(data.draw(damage(settings_of_a_run)))
     with only_user_errors():
         read_config(tmp_path / "config.yml")
+
+
+# ── files that people hand on ───────────────────────────────────────────────────────────────────────────
+
+
+MASK = {"size": [4, 5], "counts": [3, 4, 13]}
+EXAMPLE = {"photo": "a.jpg", "points": [[1, 2]], "not_points": [], "size": [50, 40], "mask": MASK}
+VALUES = {"bias": 0.1, "text": 0.2, "doubt": 0.05, "vector": [0.5, 0.5], "precision": {"a.jpg": 0.5}}
+WORD = VALUES | {"name": "door", "clip": "abc", "scene": "castle", "examples": [EXAMPLE]}
+OBJECT = {"category": "door", "segmentation": [[1, 1], [20, 1], [20, 30]], "bbox": [1, 1, 20, 30]}
+FIGURES = {"protocol": {"layout": "plain"}, "photos": {"a.jpg": {"ap_door": 0.4}}, "map": 0.4}
+
+
+def draw_labels(path: Path):
+    for photos in read_lerf_ovs(path.parent).values():
+        for outlines in photos.values():
+            outlines.truth((30, 40))
+
+
+OTHERS = {  # content, name, and what reads it
+    "words": ({"version": 1, "words": [WORD]}, "words.json", load_words),
+    "labels": ({"info": {"width": 80, "height": 60}, "objects": [OBJECT]}, "a.json", draw_labels),
+    "report": (
+        {"scene": "castle", "results": FIGURES},
+        "scores.json",
+        lambda path: EvaluatePool(reports=[path], out=path.parent / "pooled").main(),
+    ),
+    "needs": ({"sky": {"needed": True}}, "scene_needs.json", lambda path: read_needs(path.parent)),
+    "tokenizer": (
+        {"model": {"vocab": [["tower", -1.0], ["door", -2.0]]}},
+        "tokenizer.json",
+        lambda path: whole_words(path.parent),
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", OTHERS)
+@fuzz
+@given(data=st.data())
+def test_files_that_people_hand_on(tmp_path, kind, data):
+    content, name, read = OTHERS[kind]
+    if kind == "tokenizer":
+        (tmp_path / "config.json").write_text("{}")
+        (tmp_path / "model.safetensors").write_bytes(b"")
+    if data.draw(st.booleans()):
+        changed = json.dumps(data.draw(altered(content))).encode()
+    else:
+        changed = data.draw(damage(json.dumps(content).encode()))
+    (tmp_path / name).write_bytes(changed)
+    said = ""
+    try:
+        read(tmp_path / name)
+    except UserError as error:
+        said = str(error)
+    assert "\n" not in said and len(said) < 800
 
 
 # ── names of files ──────────────────────────────────────────────────────────────────────────────────────

@@ -152,7 +152,7 @@ class EvaluatePool:
             scenes[name] = results
         protocols = {name: results["protocol"] for name, results in scenes.items()}
         for key in ("layout", "scored_at"):
-            if len({protocol.get(key) for protocol in protocols.values()}) > 1:
+            if len({str(protocol.get(key)) for protocol in protocols.values()}) > 1:
                 raise UserError(f"the scenes differ in {key}: {', '.join(scenes)} can't be combined")
         if not any("map" in results for results in scenes.values()):
             raise UserError(f"no prompt was scored in {', '.join(scenes)}: there is nothing to combine")

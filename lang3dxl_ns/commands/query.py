@@ -40,7 +40,7 @@ _LEAST_PART = 1e-4
 _NEAREST = Image.Resampling.NEAREST
 _READ_BY: dict[str, tuple[str, ...]] = dict.fromkeys(("title", "credit", "license"), ("web", "scene_file"))
 _READ_BY |= dict.fromkeys(("text", "not_", "look"), ("out", "web"))
-_READ_BY |= {"vocabulary": ("web",), "photos": ("web",), "all": ("out",), "hide_floaters": ("out", "web")}
+_READ_BY |= {"vocabulary": ("web",), "photos": ("web",), "all": ("out",), "hide_floaters": ("out",)}
 """Targets of `export` that read an option. Options that are not listed are read by every target."""
 _Not = Annotated[tyro.conf.UseAppendAction[list[str]], tyro.conf.arg(name="not")]
 
@@ -92,21 +92,19 @@ class Query:
         if not prompts:
             raise UserError("there is no --text: say what to look for, such as --text windows")
         make_folder(self.out)
-        listed = self.out / "query.json"
-        before = listed.stat().st_mtime_ns if listed.is_file() else 0
         scene = load_scene(self.scene, settings=self.settings, clip=self.clip)
         scene = scene.with_words(()) if self.without_taught else scene
         question = scene.ask(parse_texts(self.text, self.not_, scene.words))
         prompts = list(question.prompts)
         *folders, shared = (self.out / slug for slug in slugs([*(p.text for p in prompts), "together"]))
-        labels, views = CocoLabels([prompt.text for prompt in prompts]), []
+        labels, views, written = CocoLabels([prompt.text for prompt in prompts]), [], set[Path]()
         best = [(False, -1.0, "")] * len(prompts)
         for name, place, asked in tracked(self._places(scene, question), "rendering"):
             wanted = question if len(asked) == len(prompts) else scene.ask([prompts[i] for i in asked])
             matches = scene.matches(wanted, place)
             for i, match in zip(asked, matches, strict=True):
                 match.save(folders[i] / f"{name}.overlay.png")
-                match.save(folders[i] / f"{name}.npy")
+                written.add(match.save(folders[i] / f"{name}.npy"))
                 save_picture(match.mask * np.uint8(255), folders[i] / f"{name}.mask.png")
                 where = f"pixel {match.peak[0]}, {match.peak[1]} of {name}"
                 best[i] = max(best[i], (match.area > 0, match.score, where))
@@ -115,7 +113,7 @@ class Query:
                 masks = [Image.fromarray(match.mask).resize(size, _NEAREST) for match in matches]
                 labels.add(place, [np.asarray(mask) for mask in masks])
             if len(matches) > 1:
-                save_picture(together(matches), shared / f"{name}.png")
+                written.add(save_picture(together(matches), shared / f"{name}.png"))
             found = [
                 {"text": m.prompt.text, "peak": m.peak, "score": m.score, "area": m.area} for m in matches
             ]
@@ -126,7 +124,7 @@ class Query:
         texts = list(zip(prompts, question.trusts, question.thresholds, folders, strict=True))
         reports = zip(question.doubts, texts, strict=True)
         report = {"texts": [_text_report(scene, d, *text) for d, text in reports], "views": views}
-        replace_file(listed, json.dumps(report, indent=2, ensure_ascii=False) + "\n")
+        replace_file(self.out / "query.json", json.dumps(report, indent=2, ensure_ascii=False) + "\n")
         for (prompt, trust, _, folder), (matches_there, score, where) in zip(texts, best, strict=True):
             taught = prompt.taught is not None
             closest = "" if matches_there else " (no match; this view comes closest)"
@@ -134,7 +132,7 @@ class Query:
             advice = None if taught else caution(prompt.text)
             say(*(f"  {line}" for line in (advice, str(trust)) if line))
         ours = [*self.out.glob("*/*.npy"), *shared.glob("*.png")]  # a user may have other folders there
-        if old := sorted({path.parent.name for path in ours if path.lstat().st_mtime_ns <= before}):
+        if old := sorted({path.parent.name for path in {*ours} - written}):
             say(f"{self.out} still has files of an earlier query, not listed in query.json: {some(old)}")
 
     def _places(self, scene: Scene, question: Question) -> list[tuple[str, Camera | str, Sequence[int]]]:
@@ -249,7 +247,7 @@ class Export:
     all: bool = False
     """Write all Gaussians. With --text, a .ply has their relevancy as a property."""
     hide_floaters: bool = False
-    """Leave out Gaussians that float where no surface is, and the sky's. A page opens with them hidden."""
+    """Leave out Gaussians that float where no surface is. A page opens with them hidden anyway."""
     index: Path | None = None
     """File (.npy or .txt) for the indices of the matching Gaussians, in the order of the scene, which is also
     the order of the splat that it was attached to. It needs --text and --out."""
@@ -290,7 +288,6 @@ class Export:
             own = read_names(self.vocabulary, "words") if self.vocabulary else ()
             words = self._clip_words(scene.file.clip)
             page = Page(scene, prompts, own, words, self._told(), self.look, self.photos)
-            page.hide_floaters = self.hide_floaters
             size = write_page(page, self.web)
             for left_out in page.left_out:
                 say(f"{left_out}.")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import product
@@ -114,6 +115,7 @@ def read_results(path: Path) -> tuple[str, dict[str, Any]]:
         for figures in results["photos"].values():
             expect(all(map(is_coordinate, figures.values())), "a photo has a figure that is not a number")
         expect(isinstance(results["protocol"], dict), "it does not say what was scored")
+        json.dumps(results["protocol"], allow_nan=False)  # raises ValueError for what can't be written
         return str(content.get("scene") or content["experiment_name"]), results
 
 

@@ -15,7 +15,6 @@ from typing import Any
 import viser.infra._infra as infra
 import websockets.server
 from viser import _messages
-from websockets.exceptions import ConnectionClosed
 
 from lang3dxl_ns.common.console import say
 from lang3dxl_ns.web.access import Access, is_local
@@ -51,9 +50,7 @@ def guard_viewers() -> None:
     async def guarded_consume(websocket: Any, *rest: Any) -> None:
         try:
             await consume(websocket, *rest)
-        except ConnectionClosed:
-            raise
-        except Exception:  # whatever viser's reading fails with: this is no message of its page
+        except Exception:  # the end of the connection, or no message of viser's page
             await websocket.close(1007)
             await websocket.recv()  # raises what viser takes for the end of a connection
 

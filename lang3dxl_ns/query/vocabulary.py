@@ -9,6 +9,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from lang3dxl_ns.common.errors import readable
 from lang3dxl_ns.common.files import read_json
 from lang3dxl_ns.common.presets import load_preset
 from lang3dxl_ns.preparation.encoders import CLIP_OPTION, find_model
@@ -89,11 +90,11 @@ def whole_words(clip: str | Path) -> tuple[str, ...]:
     """List the lower-case words of three letters or more that a CLIP's tokenizer has as single tokens. Raises
     UserError if there is no CLIP of this name or folder on this machine."""
     folder, tokens = find_model(clip, CLIP_OPTION).folder, list[Any]()
-    if (folder / "tokenizer.json").is_file():
-        tokens = read_json(folder / "tokenizer.json")["model"]["vocab"]
-    elif (folder / "vocab.json").is_file():
-        tokens = read_json(folder / "vocab.json")
-    # Unigram models list pairs of token and score; byte-pair ones map tokens to numbers.
-    names = [token if isinstance(token, str) else token[0] for token in tokens]
-    words = (_WHOLE.fullmatch(name) for name in names)
+    with readable(f"the tokenizer in {folder} can't be read", "download the model again"):
+        if (folder / "tokenizer.json").is_file():
+            tokens = read_json(folder / "tokenizer.json")["model"]["vocab"]
+        elif (folder / "vocab.json").is_file():
+            tokens = read_json(folder / "vocab.json")
+        # Unigram models list pairs of token and score; byte-pair ones map tokens to numbers.
+        words = [_WHOLE.fullmatch(token if isinstance(token, str) else token[0]) for token in tokens]
     return tuple(sorted({found["end"] or found["start"] for found in words if found}))

@@ -93,7 +93,9 @@ class Photo(HasLens):
         if self.mask_path is not None:
             with _readable(self.mask_path, self.name), open_picture(self.mask_path) as image:
                 gray = self._drawn_upright(mask_values(image))
-            mask = np.asarray(gray.resize((self.width, self.height), Image.Resampling.NEAREST)) >= 128
+            size = self.width, self.height
+            _check_shape(self.name, self.mask_path, gray.size, size, "photo")
+            mask = np.asarray(gray.resize(size, Image.Resampling.NEAREST)) >= 128
         if self.lens.distorts:
             mask = self._undistort(mask * np.uint8(255)) >= 128
         size = scaled_size(self.width, self.height, scale)
@@ -222,15 +224,15 @@ def _read_rgb(path: Path, name: str, at_least: tuple[int, int] | None = None) ->
         return eight_bits(image).convert("RGB")
 
 
-def _check_shape(name: str, path: Path, size: tuple[int, int], camera: tuple[int, int]) -> None:
-    """Raise UserError unless a photo has its camera's aspect ratio, which cropped or rotated ones lack."""
-    (width, height), (camera_width, camera_height) = size, camera
-    rounded = 0.5 / min(camera)  # the shorter side of a photo that is read small is a rounded number
-    if abs(width * camera_height / (height * camera_width) - 1) > 0.01 + rounded:
-        raise UserError(
-            f"photo {name}: {path} has {width} × {height} pixels, but its COLMAP camera {camera_width} × "
-            f"{camera_height}, another aspect ratio: use the photos that the model was made from"
-        )
+def _check_shape(
+    name: str, path: Path, size: tuple[int, int], whole: tuple[int, int], of: str = "COLMAP camera"
+) -> None:
+    """Raise UserError unless a picture has the aspect ratio of another, which cropped or turned ones lack."""
+    (width, height), (w, h) = size, whole
+    rounded = 0.5 / min(whole) + 0.5 / min(size)  # shorter sides of what is read small are rounded
+    if abs(width * h / (height * w) - 1) > 0.01 + rounded:
+        trouble = f"photo {name}: {path} has {width} × {height} pixels, but its {of} {w} × {h}"
+        raise UserError(f"{trouble}, another aspect ratio: use the model's own photos, and masks of them")
 
 
 _QUARTER_TURNS = {6: 1, 3: 2, 8: 3}

@@ -231,5 +231,5 @@ def load_words(path: Path) -> list[TaughtWord]:
     with readable(f"{path} is not a file of taught words", "save it again"):
         content = read_json(expanded(path))
         if content["version"] != _VERSION:
-            raise UserError(f"{path} has format {content['version']}: update lang3dxl-ns to read it")
+            raise UserError(f"{path} has format {content['version']!s:.20}: update lang3dxl-ns to read it")
         return words_from_json(content["words"])

@@ -156,6 +156,14 @@ def test_unreadable_files_are_named(tmp_path, photo):
         replace(photo, mask_path=tmp_path / "gone.png").read_mask()
 
 
+def test_a_mask_of_another_aspect_ratio_is_refused(photo, tmp_path):
+    masked = replace(photo, mask_path=tmp_path / "mask.png")
+    for size in ((30, 40), (7, 50), (4000, 2000), (40, 20)):
+        Image.new("L", size, 255).save(masked.mask_path)
+        with pytest.raises(UserError, match=rf"{size[0]} × {size[1]} pixels, but its photo 40 × 30"):
+            masked.read_mask()
+
+
 def test_a_mask_counts_from_half_brightness_and_fits_any_size(photo, tmp_path):
     mask = Image.new("L", (4, 3), 127)
     mask.paste(128, (2, 0, 4, 3))
