@@ -12,7 +12,7 @@ import tyro
 from lang3dxl_ns.common.console import say, some
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import read_names, write_atomically
-from lang3dxl_ns.common.reports import describe_machine, write_report
+from lang3dxl_ns.common.reports import describe_machine, markdown_table, write_report
 from lang3dxl_ns.common.settings_help import showing
 from lang3dxl_ns.evaluation.aggregate import average, pool, pooled_table, read_results, scene_table
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth, Layout, held_out_photos
@@ -127,6 +127,27 @@ class EvaluateRun(_Scored):
 
 
 @dataclass(kw_only=True)
+class EvaluateThings:
+    """Score single things against the boxes of a COCO file, and write things.md and things.json."""
+
+    scene: tyro.conf.Positional[Path | None] = None
+    """A .scene file, a folder that holds one, or a run (default: the newest under outputs/)."""
+    coco: Path
+    """COCO instances: boxes in photos of the scene; their categories are the words."""
+    out: Path
+    """Folder for the report."""
+
+    def main(self) -> None:
+        from lang3dxl_ns.evaluation.score_things import score_things
+        from lang3dxl_ns.open_scene import load_scene
+
+        scores = score_things(load_scene(self.scene), self.coco)
+        table = markdown_table(["word", "there", "found", "false", "F1"], scores)
+        write_report(self.out, "things", table, {"scores": scores})
+        print(f"{table}\n\nWrote {self.out / 'things'}.md")
+
+
+@dataclass(kw_only=True)
 class EvaluatePool:
     """Combine scenes: average over all photos, and over the scenes' means.
 
@@ -185,6 +206,7 @@ class EvaluateSplit:
 Evaluate = (
     Annotated[EvaluateMaps, tyro.conf.subcommand("maps")]
     | Annotated[EvaluateRun, tyro.conf.subcommand("run")]
+    | Annotated[EvaluateThings, tyro.conf.subcommand("things")]
     | Annotated[EvaluatePool, tyro.conf.subcommand("pool")]
     | Annotated[EvaluateSplit, tyro.conf.subcommand("split")]
 )

@@ -32,6 +32,7 @@ from lang3dxl_ns.query.trust import Trust
 from lang3dxl_ns.query.vocabulary import whole_words
 from lang3dxl_ns.scene.camera import Camera
 from lang3dxl_ns.scene.camera_path import read_camera_path
+from lang3dxl_ns.web.video import RATE, tour_shots, write_video
 from lang3dxl_ns.web.write_page import Page, write_page
 from lang3dxl_ns.words.taught_words import run_lengths
 
@@ -39,8 +40,9 @@ _LEAST_PART = 1e-4
 """Share of a photo below which a separate part of a mask is no label."""
 _NEAREST = Image.Resampling.NEAREST
 _READ_BY: dict[str, tuple[str, ...]] = dict.fromkeys(("title", "credit", "license"), ("web", "scene_file"))
-_READ_BY |= dict.fromkeys(("text", "not_", "look"), ("out", "web"))
-_READ_BY |= {"vocabulary": ("web",), "photos": ("web",), "all": ("out",), "hide_floaters": ("out", "web")}
+_READ_BY |= {"text": ("out", "web", "video"), "not_": ("out", "web", "video"), "look": ("out", "web")}
+_READ_BY |= {"vocabulary": ("web",), "photos": ("web",), "all": ("out",), "hide_floaters": ("out",)}
+_READ_BY |= {"camera_path": ("video",)}
 """Targets of `export` that read an option. Options that are not listed are read by every target."""
 _Not = Annotated[tyro.conf.UseAppendAction[list[str]], tyro.conf.arg(name="not")]
 
@@ -215,7 +217,7 @@ def _text_report(
     return told | {"threshold": threshold, "folder": folder.name}
 
 
-@showing(*("scene", "text", "not_", "out", "web", "scene_file", "title", "all"), *("look", "settings"))
+@showing("scene", "text", "not_", "out", "web", "scene_file", "video", "title", "all", "look", "settings")
 @dataclass(kw_only=True)
 class Export:
     """Write a scene in another form. --out writes a splat file of the Gaussians that match a text, in the
@@ -232,6 +234,10 @@ class Export:
     """Splat file to write, .ply, .spz, .sog or .glb."""
     web: Path | None = None
     """Folder for a web page that any static server can serve."""
+    video: Path | None = None
+    """Video to write, such as out.mp4, of the tour that the page kept in the scene's file (needs ffmpeg)."""
+    camera_path: Path | None = None
+    """Camera path saved by nerfstudio's viewer, for --video in place of the tour, with the heat of --text."""
     vocabulary: Path | None = None
     """File of more words that may name a place on the page, one per line."""
     photos: Path | None = None
@@ -247,7 +253,7 @@ class Export:
     all: bool = False
     """Write all Gaussians. With --text, a .ply has their relevancy as a property."""
     hide_floaters: bool = False
-    """Leave out Gaussians that float where no surface is, and the sky's. A page opens with them hidden."""
+    """Leave out Gaussians that float where no surface is. A page opens with them hidden anyway."""
     index: Path | None = None
     """File (.npy or .txt) for the indices of the matching Gaussians, in the order of the scene, which is also
     the order of the splat that it was attached to. It needs --text and --out."""
@@ -258,9 +264,9 @@ class Export:
     settings: Annotated[QueryConfig, tyro.conf.arg(name="")] = field(default_factory=QueryConfig)
 
     def main(self) -> None:
-        targets = [name for name in ("out", "web", "scene_file") if getattr(self, name) is not None]
+        targets = [n for n in ("out", "web", "scene_file", "video") if getattr(self, n) is not None]
         if len(targets) != 1:
-            raise UserError("give one of --out FILE.ply, --web FOLDER and --scene-file NAME.scene")
+            raise UserError("give one of --out FILE.ply, --web FOLDER, --scene-file NAME.scene, --video FILE")
         if ignored := [n for n, by in _READ_BY.items() if getattr(self, n) and targets[0] not in by]:
             option, target = (name.strip("_").replace("_", "-") for name in (ignored[0], targets[0]))
             raise UserError(f"--{option} has no effect on --{target}: leave it off")
@@ -288,12 +294,16 @@ class Export:
             own = read_names(self.vocabulary, "words") if self.vocabulary else ()
             words = self._clip_words(scene.file.clip)
             page = Page(scene, prompts, own, words, self._told(), self.look, self.photos)
-            page.hide_floaters = self.hide_floaters
             size = write_page(page, self.web)
             for left_out in page.left_out:
                 say(f"{left_out}.")
             see = f"python -m http.server -d {shlex.quote(str(self.web))}"
             say(f"Wrote {size / 1e6:.1f} MB to {self.web}; see it: {see}")
+        if self.video is not None:
+            path = [] if self.camera_path is None else read_camera_path(self.camera_path)
+            shots = [(camera, prompts, "", 1) for camera in path] or tour_shots(scene, self._told().tour)
+            count = write_video(self.video, scene, shots)
+            say(f"Wrote {count} pictures, {count / RATE:.0f} seconds, to {self.video}")
         if self.out is not None:
             text = prompts[0] if prompts else None
             count = scene.export(

@@ -42,13 +42,6 @@ class Lang3DXLPipelineConfig(EvaluationSettings, VanillaPipelineConfig):
     """Prompts for `ns-render` ("rose window; dome"), and the viewer's initial ones. The environment variable
     LANG3DXL_QUERY overrides this."""
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        """Restore settings from config.yml. An earlier version had another choice of photos."""
-        if state.get("evaluated_photos") == "test":
-            say("The run's setting evaluated_photos: test no longer exists: held-out photos are evaluated")
-            state = state | {"evaluated_photos": "held-out"}
-        self.__dict__.update(state)
-
 
 class Lang3DXLPipeline(VanillaPipeline):
     """nerfstudio's pipeline, which loads checkpoints strictly, and evaluates colors, features and words."""

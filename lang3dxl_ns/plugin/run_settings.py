@@ -25,8 +25,6 @@ _OURS = re.compile(r"lang3dxl(_|%5f)ns\.|method_name\W+lang3dxl", re.IGNORECASE)
 """Pattern that marks a config.yml as this package's: one of its classes, or a method's name."""
 _DAMAGED = (LookupError, TypeError, AttributeError, ValueError, RecursionError, ImportError)
 """Exceptions raised when settings are built from invalid values."""
-_FORMER = ("coarse_to_fine", "dense_compare", "mask_dense", "region_level")
-"""Settings that earlier versions wrote, and that a finished run can do without."""
 _UNSAFE = {"MinimalDataParser", "MinimalDataParserConfig"}
 """Names of nerfstudio classes that unpickle what they read."""
 
@@ -92,8 +90,6 @@ def _differences(settings: Any, complete: bool, place: str = "") -> Iterator[str
     """Yield a description of each setting that a file lacks or should not have, by its dotted name. With
     `complete`, settings that it lacks get their defaults instead."""
     known = {field.name: field for field in fields(settings)}
-    for name in _FORMER:
-        vars(settings).pop(name, None)
     hints, own = _hints(type(settings)), set(vars(settings))  # type: ignore[arg-type]
     if not complete:
         yield from (f"lacks the setting {place}{name}" for name in sorted(known.keys() - own))

@@ -1,8 +1,8 @@
 """Floaters: Gaussians that no surface explains, from how large they are and what the views show of them.
 
-Where photos disagree, training puts large, blurred Gaussians into the free space before what they show, or
-far behind it. They are larger than most, lie before the surface that other views see, and fill pixels in
-nearly every view that they are in, since nothing hides them.
+Where photos disagree, training puts large, blurred Gaussians into the free space before what they show. They
+are larger than most, lie before the surface that other views see, and fill pixels in nearly every view that
+they are in, since nothing hides them. Sky and ground are as large, but lie behind everything.
 """
 
 from __future__ import annotations
@@ -23,6 +23,8 @@ _SIDE = 160
 """Longer side in pixels of the views whose depth is compared."""
 _BEFORE = 0.85
 """Share of a view's depth up to which a Gaussian lies before what the view shows."""
+_LEAST_FRONT = 0.2
+"""Share of the views around it before whose surface a floater lies at least."""
 _SIZE, _FRONT, _SEEN, _BIAS = 2.2, 5.0, 3.0, -6.8
 """Weights of the score's logit; `lab/benchmarks/floaters.py` measures what they hide."""
 
@@ -53,7 +55,7 @@ def floating(
     larger = (sizes / sizes[known].median()).clamp_min(1e-9).log()
     front, share = before / (before + on + 1), seen / inside.clamp_min(1)
     logit = _SIZE * larger + _FRONT * front + _SEEN * share.clamp_max(1) + _BIAS
-    return torch.where(splats.sound(), logit, 0.0).sigmoid()
+    return torch.where(splats.sound() & (front > _LEAST_FRONT), logit.sigmoid(), 0.0)
 
 
 def _in_view(splats: Splats, camera: Camera, rendering: Rendering) -> tuple[Tensor, Tensor, Tensor]:

@@ -21,10 +21,11 @@ def read_camera_path(path: Path) -> Sequence[Camera]:
         content = read_json(path)
         width, height = int(content["render_width"]), int(content["render_height"])
         expect(content["camera_path"] != [], "it has no camera")
-        return [_path_camera(frame, width, height) for frame in content["camera_path"]]
+        return [path_camera(frame, width, height) for frame in content["camera_path"]]
 
 
-def _path_camera(frame: dict[str, Any], width: int, height: int) -> Camera:
+def path_camera(frame: dict[str, Any], width: int, height: int) -> Camera:
+    """Return the camera of a path's frame: `camera_to_world` [4, 4], and `fov`, upright and in degrees."""
     pose = torch.tensor(frame["camera_to_world"], dtype=torch.float32).reshape(4, 4)
     check_pose(pose.tolist())
     expect(0 < frame["fov"] < 180, f"a camera has a field of view of {frame['fov']} degrees")

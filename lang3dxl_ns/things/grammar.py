@@ -95,7 +95,8 @@ def parse(text: str) -> Request:
     without, relation, others = None, None, tuple[str, ...]()
     if found := re.fullmatch(r"(.+?) (?:but )?not (.+)", rest):
         rest, without = found[1], _plain(found[2])
-    if found := re.fullmatch(rf"(.+?) ({_any(words['relations'])}) (.+)", rest):
+    found = re.fullmatch(rf"(.+?) ({_any(words['relations'])}) (.+)", rest)
+    if found and _plain(found[3]) not in words["from"]:  # *on the left* names no thing
         rest, relation = found[1], words["relations"][found[2]]
         others = tuple(_plain(part) for part in re.split(r"\s+and\s+", found[3]))
         if len(others) > (2 if relation == "between" else 1):

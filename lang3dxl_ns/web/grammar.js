@@ -18,7 +18,7 @@ export function parse(text) {
   let found = /^(.+?) (?:but )?not (.+)$/.exec(rest);
   if (found) [rest, asked.without] = [found[1], plain(found[2])];
   found = new RegExp(`^(.+?) (${any(grammar.relations)}) (.+)$`).exec(rest);
-  if (found) {
+  if (found && !has(grammar.from, plain(found[3]))) {
     [rest, asked.relation, asked.others] = [found[1], grammar.relations[found[2]], found[3].split(/\s+and\s+/).map(plain)];
     if (asked.others.length > (asked.relation === "between" ? 2 : 1)) throw new Error(`${found[2]} ${found[3]}: name one thing, or two with between … and …`);
   }
@@ -45,8 +45,9 @@ function checkName(name) {
     "the third window from the left, or windows above the portal"); // prettier-ignore
 }
 
-/** Whether what was typed asks more than where something is. */
+/** Whether what was typed asks more than where something is. Quotes hold a phrase. */
 export function isQuestion(text) {
+  if (text.includes('"')) return false;
   try {
     const { count, superlative, nth, relation } = parse(text);
     return Boolean(count || superlative || nth || relation);

@@ -13,7 +13,7 @@ import { Tour } from "./tour.js";
 import { parsePrompts, tidy } from "./vocabulary.js";
 import { View } from "./view.js";
 
-const TYPING = 500, MOST_TRIED = 6, TIE = 0.02; // milliseconds until negatives take effect; suggested words; relevancies that tell words apart
+const TYPING = 500, MOST_TRIED = 6, TIE = 0.02, HALF = "50"; // milliseconds until negatives take effect; suggested words; relevancies that tell words apart; how many floaters a page hides at first
 const $ = (id) => document.getElementById(id);
 const prompts = [], taughtHere = new Set(); // names that were taught to the server's scene from here
 let about, view, photos, list, tour, steps, kept, latest = null, settled = false, cleared = 0; // settled: the address has been read; cleared: how often all prompts were removed
@@ -102,7 +102,7 @@ async function ask(typed, turn = cleared) {
 
 /** Answer a question about things, such as "how many windows" or "highest tower". */
 async function answerQuestion(typed) {
-  const told = await list.question(typed, async (word) => (await ask(`"${word}"`)).known);
+  const told = await list.question(typed, async (word) => (await ask(quoted(word))).known);
   if (told) say(told);
   return { known: told !== null, told };
 }
@@ -262,7 +262,7 @@ async function tell({ x, y, without }) {
   if (list.pick(rows)) return;
   const best = words[0]?.[1] ?? 0;
   const tied = words.filter(([, score]) => score > best - TIE), several = tied.length > 2;
-  const buttons = (several ? tied : words).map(([word, score]) => choice(several ? word : `${word} ${percent(score)}`, () => ask(word)));
+  const buttons = (several ? tied : words).map(([word, score]) => choice(several ? word : `${word} ${percent(score)}`, () => ask(quoted(word))));
   quiet();
   const told = several ? "Here several words fit equally well, so none is sure:" : "Here, words that fit best:";
   $("here").replaceChildren(element("p", {}, words.length ? told : `Nothing is there${rows.length ? " that has a name" : ""}.`),
@@ -387,7 +387,8 @@ function namedWord(text) {
 
 // ── address ──
 
-const asTyped = ({ text, negatives }) => `"${text}"` + (negatives.length ? ` not ${negatives.map((one) => `"${one}"`).join(", ")}` : "");
+const quoted = (text) => `"${text}"`;
+const asTyped = ({ text, negatives }) => quoted(text) + (negatives.length ? ` not ${negatives.map(quoted).join(", ")}` : "");
 
 function asField(prompt) {
   const { examples, color, chosen } = prompt;
@@ -398,7 +399,7 @@ function asField(prompt) {
 const shownNow = (stops = tour.fields) =>
   written({
     stops,
-    view: view.mover.address, walk: view.mover.walking ? 1 : "", not: $("not").value, hide: Number($("hide").value) || "", look: chosenLook,
+    view: view.mover.address, walk: view.mover.walking ? 1 : "", not: $("not").value, hide: $("hide").value === HALF ? "" : $("hide").value, look: chosenLook,
     unit: about.unit, cameras: $("cameras").ariaPressed === "true" ? 1 : "", photo: photos.shown?.name, ...list.fields,
     prompts: prompts.filter(({ examples }) => !examples || examples.length).map(asField),
   }); // prettier-ignore
@@ -420,7 +421,7 @@ async function apply(hash, turn = drop(), isStop = false) {
   view.mover.walk(wanted.walk === "1");
   if (!isStop) about.unit = Number(wanted.unit) > 0 && Number.isFinite(Number(wanted.unit)) ? Number(wanted.unit) : null;
   $("cameras").ariaPressed = String(wanted.cameras === "1");
-  $("hide").value = Number(wanted.hide) || 0;
+  $("hide").value = wanted.hide ?? HALF;
   hideFloaters();
   attempt(() => chooseLook(wanted.look ?? ""));
   const common = $("not").value !== (wanted.not ?? "");
@@ -474,7 +475,7 @@ async function offer() {
 async function suggest() {
   const known = about.suggested.length ? about.suggested : await think("offered", { typed: "" });
   const words = [...new Set([...kept.list("words").map(({ name }) => String(name)), ...known])];
-  $("try").replaceChildren("Try: ", ...words.slice(0, MOST_TRIED).map((word) => choice(word, () => ask(word))));
+  $("try").replaceChildren("Try: ", ...words.slice(0, MOST_TRIED).map((word) => choice(word, () => ask(quoted(word)))));
 }
 
 function on(id, kind, act) {
@@ -653,7 +654,6 @@ async function begin() {
   if (about.words) setTimeout(() => think("space").then((space) => (view.mover.space = space))); // behind the prompts
   setTimeout(() => attempt(readFloaters));
   if (about.detail) new Detail(about, view, think, { read: fetched, question, failed: (error) => say(error.message) });
-  if (about.hide) $("hide").value = 50;
   const { stops, play } = readFields(location.hash);
   if (location.hash.length > 1) await apply(location.hash, turn);
   else for (const [text, ...negatives] of about.prompts) if (turn === cleared) await ask(asTyped({ text, negatives }), turn);

@@ -104,8 +104,6 @@ class Page:
     """Training photo whose lighting is shown; default: the overview photo."""
     photos: Path | None = None
     """Folder of the photos, of which the page shows small copies; if None, it shows their cameras alone."""
-    hide_floaters: bool = False
-    """Whether the page opens with floaters hidden."""
     live: bool = False
     """Whether a server encodes any other text (`answer`)."""
     own_words: PageWords = field(default_factory=PageWords)
@@ -168,7 +166,7 @@ class Page:
             count = len(self.whole.splats)
             about["detail"] = {"rows": self.levels.rows, "chunks": bounds, "count": count}
         files |= self._photos(about)
-        about["floaters"], about["hide"] = "api/floaters" if self.live else "floaters.bin", self.hide_floaters
+        about["floaters"] = "api/floaters" if self.live else "floaters.bin"
         if not self.live:
             files["floaters.bin"] = self.floaters()
         about["looks"] = {name: f"api/look?photo={quote(name)}" for name in self._looks}

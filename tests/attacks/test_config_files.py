@@ -3,7 +3,6 @@
 import contextlib
 import math
 import os
-import re
 import shutil
 import zipfile
 
@@ -152,25 +151,6 @@ def test_a_run_with_an_unknown_setting_does_not_open(copy):
         open_run(path)
 
 
-@pytest.mark.parametrize(
-    ("gone", "before"),
-    [
-        ("coarse_to_fine: null", "code_std"),
-        ("dense_compare: target", "ssim_lambda"),
-        ("mask_dense: false", "ssim_lambda"),
-        ("region_level: large", "sam"),
-    ],
-)
-def test_a_run_with_a_setting_that_is_gone_still_opens(copy, gone, before):
-    path = copy / "config.yml"
-    text, known = path.read_text(), re.compile(rf"^( +){before}: ", re.MULTILINE)
-    assert len(known.findall(text)) == 1
-    path.write_text(known.sub(rf"\g<1>{gone}\n\g<0>", text))
-    pipeline = open_run(path)[0].pipeline
-    for settings in (pipeline.model, pipeline.model.semantic_field, pipeline.datamanager):
-        assert not hasattr(settings, gone.partition(":")[0])
-
-
 def cuts(text: str) -> list[int]:
     """Places to truncate a config: after some lines, and inside others."""
     ends = [i for i, c in enumerate(text) if c == "\n"]
@@ -315,6 +295,8 @@ def test_photos_that_may_not_be_read_are_not_taken_for_gone(copy, monkeypatch):
         ("sh_degree: 3", "sh_degree: null"),
         ("densify_until: 0.5", "densify_until: .nan"),
         ("background_color: black", "background_color: -5"),
+        ("evaluated_photos: held-out", "evaluated_photos: test"),
+        ("evaluated_photos: held-out", "evaluated_photos: [1]"),
     ],
 )
 def test_values_of_another_kind_are_named(tmp_path, setting, other):
@@ -323,17 +305,6 @@ def test_values_of_another_kind_are_named(tmp_path, setting, other):
     (tmp_path / "config.yml").write_text(text.replace(setting, other))
     with pytest.raises(UserError, match=f"sets .*{setting.partition(':')[0]}"):
         read_config(tmp_path / "config.yml")
-
-
-def test_a_choice_of_photos_that_no_longer_exists_is_told_and_replaced(copy, capsys):
-    text = (copy / "config.yml").read_text()
-    assert "evaluated_photos: held-out" in text
-    (copy / "config.yml").write_text(text.replace("evaluated_photos: held-out", "evaluated_photos: test"))
-    assert read_config(copy / "config.yml").pipeline.evaluated_photos == "held-out"
-    assert "evaluated_photos: test no longer exists" in capsys.readouterr().out
-    (copy / "config.yml").write_text(text.replace("evaluated_photos: held-out", "evaluated_photos: [1]"))
-    with pytest.raises(UserError, match="evaluated_photos"):
-        read_config(copy / "config.yml")
 
 
 def test_a_run_made_on_windows_opens(tmp_path):

@@ -106,6 +106,7 @@ def test_a_box_turns_with_its_points():
         ("how many windows are there?", Request("windows", count=True)),
         ("highest tower", Request("tower", superlative="highest")),
         ("the third window from the left", Request("window", nth=3, along="left")),
+        ("third window on the left", Request("window", nth=3, along="left")),
         ("windows left of the portal", Request("windows", relation="left", others=("portal",))),
         ("the window between the portals", Request("window", relation="between", others=("portals",))),
         ("count windows not doors", Request("windows", count=True, without="doors")),

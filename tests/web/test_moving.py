@@ -209,9 +209,5 @@ def test_an_overview_fits_every_window_below_its_buttons(page):
             slopes = ways @ np.stack([right, np.cross(ahead, right)], axis=1) / (ways @ ahead)[:, None]
             pixels = slopes * high / 2 / np.tan(np.radians(fov) / 2) + [wide / 2, high / 2]
             inside = -0.03 * wide <= pixels[0, 0] < pixels[1, 0] <= 1.03 * wide
-            assert inside or fov == 110, (
-                extent,
-                wide,
-                high,
-            )  # else a wider lens shows all
+            assert inside or fov == 110, (extent, wide, high)  # the widest lens
             assert 50 <= pixels[2, 1] < pixels[3, 1] <= high - 50, (extent, wide, high)

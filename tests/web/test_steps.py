@@ -73,14 +73,17 @@ def test_a_link_carries_thresholds_colors_and_moving(page, browser, address):
       const slider = document.querySelector("#prompts li:last-child input[type=range]");
       slider.value = 0.77;
       for (const kind of ["input", "change"]) slider.dispatchEvent(new Event(kind, { bubbles: true }));
+      const hide = document.getElementById("hide");
+      hide.value = 0;  // shows floaters, which are hidden otherwise
+      for (const kind of ["input", "change"]) hide.dispatchEvent(new Event(kind, { bubbles: true }));
     }""")
     page.get_by_role("button", name="Walk").click()
     page.get_by_role("button", name="Remove dome").click()
     until(page, "lang3dxl.prompts.length", 1)
     told = """[lang3dxl.prompts.map(({ text, threshold, color }) => [text, threshold, color]),
-      lang3dxl.view.mover.walking, lang3dxl.view.mover.address]"""
+      lang3dxl.view.mover.walking, document.getElementById("hide").value, lang3dxl.view.mover.address]"""
     shown = page.evaluate(told)
-    for part in ("at=0.77", "walk=1"):
+    for part in ("at=0.77", "walk=1", "hide=0"):
         until_linked(page, part)
     until_linked(page, "dome", False)
     other = opened(browser, page.url, DESK)

@@ -14,6 +14,7 @@ from lang3dxl_ns.things.thing import Thing, upright_box
 from lang3dxl_ns.web.write_page import Page, write_page
 
 QUESTIONS = [
+    *("the big door on the left", "third window on the left"),
     *("how many windows are there?", "highest tower", "the third window from the left", "rose window"),
     *("windows left of the portal", "the window between the doors and gates", "count windows not doors"),
     *("largest window above the portal", "2nd window from the top", "windows in front of all the towers"),
@@ -53,6 +54,13 @@ def test_a_question_is_read_as_by_python(page, text):
     except UserError as error:
         expected = str(error)
     assert found == expected
+
+
+def test_a_place_is_no_question_and_quotes_hold_a_phrase(page):
+    ask = "return given.map(m.isQuestion);"
+    assert module(page, "grammar", ask, ["third window on the left", "doors in a wall"]) == [True, True]
+    plain = ["the big door on the left", "red roof", '"statue on a roof"', "windows not doors", "towers"]
+    assert module(page, "grammar", ask, plain) == [False] * len(plain)
 
 
 SUPERLATIVES = ("", "highest ", "widest ", "leftmost ", "largest ")

@@ -1,7 +1,9 @@
 """A tour on the page: kept views with words and captions, in the link, played in order."""
 
 import json
+import subprocess
 
+import numpy as np
 import pytest
 from pages import DESK, browser, served, until
 from painted_scene import painted_scene
@@ -17,6 +19,7 @@ from lang3dxl_ns.files.scene_file import (
     replace_scene,
 )
 from lang3dxl_ns.web.teach import PageWords
+from lang3dxl_ns.web.video import tour_shots, write_video
 from lang3dxl_ns.web.write_page import Page, write_page
 
 STOPS = [("the dome & its cross; “high”", "dome"), ("", "windows")]
@@ -81,6 +84,11 @@ def test_a_damaged_tour_opens_and_plays(browser, address, hostile):
         assert not page.evaluate("document.querySelector('#stops b, #caption b')")
 
 
+TOUR = "#stop=caption%3DThe%2Bdome%26view%3D0%2C-4%2C0%2C0%2C0%2C0%2C60%26ask%3Ddome"
+TOUR += "&stop=view%3D1%2C-3%2C0.5%2C0%2C0%2C0%2C50"
+"""Two stops, as the page writes them; the first has a caption and a prompt."""
+
+
 def test_a_tour_is_kept_in_the_scenes_file_and_plays_from_there(browser, file, tmp_path):
     with live(file) as server, visit(browser, server.access.address, DESK) as page:
         page.evaluate("document.getElementById('tour').open = true")
@@ -91,7 +99,10 @@ def test_a_tour_is_kept_in_the_scenes_file_and_plays_from_there(browser, file, t
             page.keyboard.type("High")
             page.keyboard.press("Tab")
     tour = describe_scene_file(file)["provenance"].tour
-    assert tour.count("stop=") == 1 and "caption%3DHigh" in tour and "dome" in tour
+    ((_, prompts, caption, _),) = tour_shots(
+        read_scene(file, "cpu"), tour
+    )  # Python reads what the page wrote
+    assert caption == "High" and [prompt.text for prompt in prompts] == ["dome"]
     keep_words(file, {})  # what teaches a word keeps the tour
     replaced, _ = replace_scene(file, read_scene(file, "cpu"), Provenance())
     told = describe_scene_file(file)["provenance"]
@@ -106,3 +117,39 @@ def test_a_tour_is_kept_in_the_scenes_file_and_plays_from_there(browser, file, t
 def test_what_is_no_tour_is_not_kept(content):
     with pytest.raises(UserError, match="no tour"):
         PageWords().keep_tour(json.loads(content))
+
+
+def test_a_video_flies_through_the_tour(tmp_path):
+    scene = painted_scene()
+    shots = tour_shots(scene, TOUR, (96, 64))
+    (first, prompts, caption, still), *_, (last, nothing, no_caption, end) = shots
+    assert [prompt.text for prompt in prompts] == ["dome"] and caption == "The dome"
+    assert not nothing and not no_caption and still > end  # a caption takes time to read
+    np.testing.assert_allclose(first.position, [0, -4, 0], atol=1e-5)
+    np.testing.assert_allclose(last.position, [1, -3, 0.5], atol=1e-5)
+    turned = last.view_matrix.double().numpy() @ [0, 0, 0, 1]
+    assert turned[2] > 0 and np.abs(turned[:2]).max() < 1e-5  # it looks at what the stop turns around
+    count = write_video(tmp_path / "a.mkv", scene, [(*shot[:3], 1) for shot in shots[-3:]])
+    raw = ["-pix_fmt", "rgb24", "-f", "rawvideo", "-"]
+    read = ["ffmpeg", "-loglevel", "error", "-i", str(tmp_path / "a.mkv"), *raw]
+    done = subprocess.run(read, capture_output=True, check=True)
+    pictures = np.frombuffer(done.stdout, np.uint8).reshape(-1, 64, 96, 3)
+    assert count == len(pictures) == 3
+    assert np.abs(pictures[-1].astype(float) - scene.render(last).pixels).mean() < 8
+    assert [path.name for path in tmp_path.iterdir()] == ["a.mkv"]
+
+
+def test_a_video_says_what_it_lacks(tmp_path, monkeypatch):
+    scene = painted_scene()
+    shots = tour_shots(scene, TOUR.replace("ask%3D", "x%3D"), (96, 64))
+    with pytest.raises(UserError, match="choose another name"):
+        write_video(tmp_path / "a.nothing", scene, shots[-1:])
+    assert not list(tmp_path.iterdir())
+    for bad in ("#stop=view%3D1", "#stop=view%3Da%2Cb", "#stop=", "#stop=view%3D1%2C2%2C3%2C4%2C5%2C6%2C700"):
+        with pytest.raises(UserError, match="tour"):
+            tour_shots(scene, bad)
+    with pytest.raises(UserError, match="no tour"):
+        tour_shots(scene, "")
+    monkeypatch.setenv("PATH", "")
+    with pytest.raises(UserError, match="needs ffmpeg"):
+        write_video(tmp_path / "a.mp4", scene, shots[:1])

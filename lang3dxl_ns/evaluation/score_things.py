@@ -1,0 +1,59 @@
+"""Scores of single things against COCO instances: boxes that people drew in photos."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray as Array
+from scipy.optimize import linear_sum_assignment
+
+from lang3dxl_ns.common.errors import UserError, readable
+from lang3dxl_ns.common.files import read_json
+from lang3dxl_ns.query.scene import Scene
+from lang3dxl_ns.things.write import coco
+
+
+def score_things(scene: Scene, path: Path) -> list[tuple[str, int, int, int, float]]:
+    """Compare the things of each category of a COCO file with its boxes, in the photos that it names. Return
+    for each word the number of boxes there, found (intersection over union of at least a half) and false, and
+    F1. Raises UserError for other files."""
+    with readable(f"{path} holds no COCO instances", "export the boxes from the labeling tool as COCO"):
+        content = read_json(path)
+        true, words = _boxes(content), [str(category["name"]) for category in content["categories"]]
+        names = {image["file_name"] for image in content["images"]} & {photo.name for photo in scene.photos}
+    if not names or not words:
+        raise UserError(f"{path} names no photo of this scene: file_name must be {scene.photos[0].name}, …")
+    given, scores = _boxes(coco(scene, scene.things(words))), []
+    for word in words:
+        sides = [
+            [np.array(boxes.get((n, word), [])).reshape(-1, 4) for boxes in (true, given)] for n in names
+        ]
+        there, listed = (sum(len(side[i]) for side in sides) for i in (0, 1))
+        found = sum(_matches(*side) for side in sides)
+        scores.append((word, there, found, listed - found, round(2 * found / max(there + listed, 1), 3)))
+    return scores
+
+
+def _boxes(content: dict[str, Any]) -> dict[tuple[str, str], list[list[float]]]:
+    """List corners, as shares of the photo's sides, by photo and word."""
+    images = {
+        image["id"]: (image["file_name"], image["width"], image["height"]) for image in content["images"]
+    }
+    words = {c["id"]: str(c["name"]) for c in content["categories"]}
+    found: dict[tuple[str, str], list[list[float]]] = {}
+    for label in content["annotations"]:
+        (name, wide, tall), (x, y, width, height) = images[label["image_id"]], map(float, label["bbox"])
+        corners = [x / wide, y / tall, (x + width) / wide, (y + height) / tall]
+        found.setdefault((name, words[label["category_id"]]), []).append(corners)
+    return found
+
+
+def _matches(true: Float[Array, "n 4"], given: Float[Array, "m 4"]) -> int:
+    low, high = np.maximum(true[:, None, :2], given[:, :2]), np.minimum(true[:, None, 2:], given[:, 2:])
+    shared = (high - low).clip(0).prod(2)
+    areas = [(boxes[:, 2:] - boxes[:, :2]).prod(1) for boxes in (true, given)]
+    same = 2 * shared >= areas[0][:, None] + areas[1] - shared
+    return int(same[linear_sum_assignment(same, maximize=True)].sum())

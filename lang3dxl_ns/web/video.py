@@ -1,0 +1,107 @@
+"""Videos of a flight along a tour or a camera path, with the heat of words and captions (ffmpeg)."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
+from pathlib import Path
+from urllib.parse import parse_qsl
+
+import numpy as np
+from jaxtyping import Float64
+from numpy import ndarray as Array
+from PIL import Image, ImageDraw, ImageFont
+
+from lang3dxl_ns.common.console import tracked
+from lang3dxl_ns.common.errors import UserError, readable
+from lang3dxl_ns.common.files import expanded
+from lang3dxl_ns.query.match import together
+from lang3dxl_ns.query.scene import Scene
+from lang3dxl_ns.query.text import Prompt, parse_prompts
+from lang3dxl_ns.scene.camera import Camera
+from lang3dxl_ns.scene.camera_path import path_camera
+from lang3dxl_ns.things.find import up_of
+
+RATE, SIZE = 25, (1280, 720)
+"""Pictures per second, and their width and height in pixels."""
+_FLIGHT, _PAUSE, _LETTER = 2.0, 3.0, 0.06
+"""Seconds of a flight, at a stop, and for each letter of its caption."""
+Shot = tuple[Camera, Sequence[Prompt], str, int]
+"""A camera, the prompts whose heat is drawn, a caption, and the number of pictures that show it."""
+
+
+def tour_shots(scene: Scene, tour: str, size: tuple[int, int] = SIZE) -> list[Shot]:
+    """Plan a flight through the stops of a tour, which is written as in the page's link. Raises UserError if
+    it has no stop, or is damaged."""
+    shots, up = list[Shot](), up_of(scene)
+    with readable("the scene's tour can't be read", "keep its views again in the page"):
+        stops = [_stop(text) for name, text in parse_qsl(tour.removeprefix("#")) if name == "stop"]
+        for (before, *_), (stand, prompts, caption) in zip([*stops[:1], *stops], stops, strict=False):
+            times = np.linspace(0, 1, 1 + int(RATE * _FLIGHT))[1:] if shots else np.ones(1)
+            for ease in times**2 * (3 - 2 * times):
+                camera = _camera(before + ease * (stand - before), up, size)
+                shots.append((camera, prompts, caption, 1))
+            shots[-1] = (*shots[-1][:3], int(RATE * (_PAUSE + _LETTER * len(caption))))
+    if not shots:
+        raise UserError("there is no tour: keep views in the page of lang3dxl view, or give --camera-path")
+    return shots
+
+
+def _stop(text: str) -> tuple[Float64[Array, "7"], list[Prompt], str]:
+    """Read a stop: position, point that is looked at and field of view in degrees; prompts; caption."""
+    fields = parse_qsl(text)
+    prompts = [prompt for name, value in fields if name == "ask" for prompt in parse_prompts(value)]
+    stand = np.array([float(number) for number in dict(fields)["view"].split(",")])
+    return stand.reshape(7), prompts, dict(fields).get("caption", "")
+
+
+def _camera(stand: Float64[Array, "7"], up: Float64[Array, "3"], size: tuple[int, int]) -> Camera:
+    back = (stand[:3] - stand[3:6]) / max(np.linalg.norm(stand[:3] - stand[3:6]), 1e-9)
+    right = np.cross(up + 1e-6 * np.roll(up, 1), back)  # also for a look straight down
+    right /= np.linalg.norm(right)
+    pose = np.vstack([np.stack([right, np.cross(back, right), back, stand[:3]], axis=1), [0, 0, 0, 1]])
+    return path_camera({"camera_to_world": pose.tolist(), "fov": float(stand[6])}, *size)
+
+
+def write_video(path: Path, scene: Scene, shots: Sequence[Shot]) -> int:
+    """Write a video in the format that the name's ending tells, and return the number of pictures. Raises
+    UserError without ffmpeg, or if it can't write the file."""
+    if shutil.which("ffmpeg") is None:
+        raise UserError("a video needs ffmpeg: apt install ffmpeg, or conda install ffmpeg")
+    first, path = shots[0][0], expanded(path).absolute()
+    partial = path.with_name(f"{path.stem}.{os.getpid()}{path.suffix}")
+    read = f"-f rawvideo -pix_fmt rgb24 -r {RATE} -s {first.width}x{first.height} -i -"
+    command = ["ffmpeg", "-loglevel", "error", *read.split(), "-pix_fmt", "yuv420p", f"{partial}"]
+    try:
+        with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+            with suppress(BrokenPipeError):  # ffmpeg says why
+                for picture in _pictures(scene, tracked(shots, "rendering")):
+                    process.stdin.write(picture)  # type: ignore[union-attr]
+            said = " ".join(process.communicate()[1].decode(errors="replace").split())
+        if process.returncode:
+            raise UserError(f"ffmpeg can't write {path} ({said[:200]}): choose another name, as out.mp4")
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)
+    return sum(count for *_, count in shots)
+
+
+def _pictures(scene: Scene, shots: Iterable[Shot]) -> Iterator[bytes]:
+    """Render the shots, and yield the pixels of each picture."""
+    asked, question = None, None
+    for camera, prompts, caption, count in shots:
+        if prompts != asked:
+            asked, question = prompts, scene.ask(list(prompts)) if prompts else None
+        if question is None:
+            pixels = scene.render(camera).pixels
+        else:
+            pixels = together(scene.matches(question, camera))[: camera.height]  # without the legend
+        picture = Image.fromarray(np.ascontiguousarray(pixels))
+        if caption:
+            place, font = (camera.width / 2, 0.93 * camera.height), ImageFont.load_default(camera.height / 24)
+            pen = ImageDraw.Draw(picture)
+            pen.text(place, caption, font=font, anchor="mm", stroke_width=2, stroke_fill="black")
+        yield from [picture.tobytes()] * count

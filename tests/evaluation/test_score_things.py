@@ -1,0 +1,50 @@
+"""Scores of things against COCO instances."""
+
+import json
+
+import pytest
+from painted_scene import painted_scene
+
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.evaluation.score_things import score_things
+from lang3dxl_ns.things.write import coco
+
+
+def test_own_boxes_score_full_marks_in_any_size_and_each_is_found_once(tmp_path):
+    scene, file = painted_scene(), tmp_path / "labels.json"
+    content = coco(scene, scene.things("windows"))
+    file.write_text(json.dumps(content))
+    count = len(content["annotations"])
+    assert count > 2
+    assert score_things(scene, file) == [("windows", count, count, 0, 1.0)]
+    for image in content["images"]:  # labeled in photos of twice the size
+        image["width"], image["height"] = 2 * image["width"], 2 * image["height"]
+    for label in content["annotations"]:
+        label["bbox"] = [2 * side for side in label["bbox"]]
+    file.write_text(json.dumps(content))
+    assert score_things(scene, file) == [("windows", count, count, 0, 1.0)]
+    content["annotations"] += content["annotations"]
+    file.write_text(json.dumps(content))
+    assert score_things(scene, file) == [("windows", 2 * count, count, 0, 0.667)]
+    for label in content["annotations"]:
+        label["bbox"][0] += label["bbox"][2]
+    file.write_text(json.dumps(content))
+    ((_, _, found, false, _),) = score_things(scene, file)
+    assert found < count and false == count - found
+
+
+FLAT = {
+    "images": [{"id": 1, "file_name": "x", "width": 0, "height": 1}],
+    "categories": [{"id": 1, "name": "x"}],
+    "annotations": [{"image_id": 1, "category_id": 1, "bbox": [0, 0, 1, 1]}],
+}
+NUMBERS = {"images": 3, "categories": 3, "annotations": [1]}
+EMPTY = {"images": [], "categories": [], "annotations": []}
+
+
+@pytest.mark.parametrize("text", ["[]", "{", *map(json.dumps, (EMPTY, NUMBERS, FLAT))])
+def test_what_is_no_coco_file_of_the_scene_is_said(tmp_path, text):
+    file = tmp_path / "labels.json"
+    file.write_text(text)
+    with pytest.raises(UserError, match=r"labels\.json"):
+        score_things(painted_scene(), file)
