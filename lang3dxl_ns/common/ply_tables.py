@@ -9,6 +9,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from lang3dxl_ns.common.checks import expect
+from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import UserError
 
 _LONGEST_HEADER = 1 << 16
@@ -43,8 +44,8 @@ class Table:
 
 def read_header(file: BinaryIO) -> tuple[str, dict[str, Table], list[str]]:
     """Read the form, the tables in the file's order, and all lines of the header. The file is left at the
-    first table's data. Raises UserError for a column of an unknown type, and one of `DAMAGE` for a damaged
-    file."""
+    first table's data. Tells of rows that no table announces. Raises UserError for a column of an unknown
+    type, and one of `DAMAGE` for a damaged file."""
     head = file.read(_LONGEST_HEADER)
     expect(head.startswith(b"ply"), "it doesn't begin like a PLY")
     end = re.search(rb"^end_header[ \t]*\r?\n", head, re.MULTILINE)
@@ -67,6 +68,9 @@ def read_header(file: BinaryIO) -> tuple[str, dict[str, Table], list[str]]:
     size = file.seek(0, 2) - file.seek(end.end())
     announced = sum(table.length * table.row().itemsize for table in tables.values())
     expect(form == "ascii" or announced <= size, "it announces more than it holds")
+    row = 0 if form == "ascii" or any(table.lists for table in tables.values()) else table.row().itemsize
+    if row and announced and size - announced >= row:
+        say(f"{file.name} holds {(size - announced) // row} rows more than its header announces: left out")
     return form, tables, lines
 
 

@@ -355,6 +355,17 @@ def test_rows_that_are_not_as_announced_are_refused_rather_than_read_shifted(for
         read_splats(tmp_path / "b.ply")
 
 
+@pytest.mark.parametrize(("order", "kind"), [("little", "<f4"), ("big", ">f4")])
+def test_rows_that_no_table_announces_are_told(order, kind, tmp_path, capsys):
+    write_splats(tmp_path / "a.ply", some_splats(5))
+    write_table(tmp_path / "b.ply", table(tmp_path / "a.ply")[1], f"binary_{order}_endian", kind, "float")
+    content = (tmp_path / "b.ply").read_bytes()
+    assert len(read_splats(tmp_path / "b.ply")) == 5 and "more than" not in capsys.readouterr().out
+    (tmp_path / "b.ply").write_bytes(content.replace(b"vertex 5", b"vertex 3", 1))
+    assert len(read_splats(tmp_path / "b.ply")) == 3
+    assert "b.ply holds 2 rows more than its header announces" in capsys.readouterr().out
+
+
 def test_comments_and_properties_of_other_programs_are_skipped(tmp_path):
     write_splats(tmp_path / "a.ply", some_splats(5))
     _, rows = table(tmp_path / "a.ply")
