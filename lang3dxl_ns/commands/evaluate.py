@@ -32,7 +32,7 @@ class _Scored:
     """Folder for the report."""
 
 
-@showing("maps", "ground_truth", "photos", "masks", "out")
+@showing("maps", "ground_truth", "out")
 @dataclass(kw_only=True)
 class EvaluateMaps(_Scored):
     """Score relevancy maps made by any system, and write scores.md and scores.json.

@@ -85,7 +85,8 @@ def test_a_command_that_needs_nerfstudio_says_how_to_install_it(monkeypatch, tmp
         cli.main(["doctor"])
     monkeypatch.setitem(sys.modules, "nerfstudio", None)
     monkeypatch.setitem(sys.modules, "nerfstudio.data.scene_box", None)
-    monkeypatch.delitem(sys.modules, "lang3dxl_ns.plugin.load_scene", raising=False)
+    for name in ("lang3dxl_ns.plugin.load_scene", "lang3dxl_ns.plugin.model"):
+        monkeypatch.delitem(sys.modules, name, raising=False)
     (tmp_path / "config.yml").write_text("x")
     with pytest.raises(UserError, match=r"\.\[nerfstudio\]"):
         load_scene(tmp_path)
