@@ -61,6 +61,14 @@ def test_the_sdist_is_reproducible_and_makes_the_same_wheel(built):
     assert content("wheel-of-sdist") == content("wheel")
 
 
+def test_the_sdist_holds_the_project_alone(built):
+    """A checkout holds environments and scenes too, of gigabytes."""
+    (source,) = (built / "unpacked").iterdir()
+    ours = {".ci", "configs", "docs", "lab", "lang3dxl_ns", "tests", "pyproject.toml"}
+    told = {"README.md", "LICENSE", "CITATION.cff", "PKG-INFO", ".gitignore"}
+    assert {path.name for path in source.iterdir()} == ours | told
+
+
 def test_commands_run_from_it_alone(wheel, tmp_path):
     zipfile.ZipFile(wheel).extractall(tmp_path / "installed")
     environment = os.environ | {"PYTHONPATH": str(tmp_path / "installed")}
