@@ -27,14 +27,16 @@ PLAYED = """async () => {
   const stops = [], seen = (caption) => {
     const words = lang3dxl.prompts.map(({ text }) => text).join();
     const shown = caption.hidden ? "" : caption.textContent;
-    if (stops.at(-1)?.[1] !== words) stops.push([shown, words, lang3dxl.view.mover.address]);
-    else stops.at(-1)[2] = lang3dxl.view.mover.address;
+    if (stops.at(-1)?.[1] !== words) stops.push([shown, words, {}]);
+    const times = stops.at(-1)[2], { address } = lang3dxl.view.mover;
+    times[address] = 1 + (times[address] ?? 0);
   };
   const watch = setInterval(() => seen(document.getElementById("caption")), 20);
   lang3dxl.clear();
   await lang3dxl.tour.play(1500);
   clearInterval(watch);
-  return stops.filter(([, words]) => words);
+  const longest = (times) => Object.entries(times).sort(([, a], [, b]) => b - a)[0][0]; // not a flight
+  return stops.filter(([, words]) => words).map(([shown, words, times]) => [shown, words, longest(times)]);
 }"""
 
 
