@@ -111,8 +111,8 @@ def test_a_tour_is_kept_in_the_scenes_file_and_plays_from_there(browser, file, t
     assert told.tour == tour
     write_page(Page(replaced, provenance=told), tmp_path / "page")
     with served(tmp_path / "page") as address, visit(browser, f"{address}#play=1", DESK) as page:
-        page.wait_for_function("document.getElementById('caption').textContent === 'High'")
-        page.wait_for_function("lang3dxl.prompts.some(({ text }) => text === 'dome')")
+        until(page, "document.getElementById('caption').textContent === 'High'")
+        until(page, "lang3dxl.prompts.some(({ text }) => text === 'dome')")
 
 
 @pytest.mark.parametrize("content", ["[]", "{}", '{"tour": 3}', "null"])
