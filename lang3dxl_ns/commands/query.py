@@ -177,13 +177,21 @@ class CocoLabels:
                 if area < _LEAST_PART * mask.size:
                     continue
                 rows, columns = place
-                whole = np.zeros(mask.shape, bool)
-                whole[place] = part
                 box = [columns.start, rows.start, columns.stop - columns.start, rows.stop - rows.start]
-                outline = {"size": [height, width], "counts": run_lengths(whole)}
+                outline = {"size": [height, width], "counts": _runs(part, place, mask.shape)}
                 labeled = {"id": len(annotations) + 1, "image_id": len(images), "category_id": category}
                 found = {"segmentation": outline, "area": area, "bbox": box, "iscrowd": 0}
                 annotations.append({**labeled, **found})
+
+
+def _runs(part: Bool[Array, "r c"], place: tuple[slice, slice], size: tuple[int, ...]) -> list[int]:
+    """Return the `run_lengths` of a mask of this size with one part at a place, from its columns alone."""
+    (rows, columns), (height, width) = place, size
+    runs = run_lengths(np.pad(part, ((rows.start, height - rows.stop), (0, 0))))
+    runs[0] += height * columns.start
+    runs += [0] * (len(runs) % 2 == 0)
+    runs[-1] += height * (width - columns.stop)
+    return runs if runs[-1] else runs[:-1]
 
 
 def parse_texts(

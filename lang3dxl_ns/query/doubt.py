@@ -1,5 +1,4 @@
-"""Doubt about a prompt: the share of words for absent things that match the scene as well as the prompt; and
-thresholds, above which Gaussians match.
+"""Doubt about a prompt: the share of words for absent things that match the scene as well as the prompt.
 
 A relevancy above 0.5 somewhere proves little, since among many Gaussians a few match any text, even nonsense.
 So unrelated words are queried too, and a prompt is ranked among them by its best Gaussians. The rule does not
@@ -14,7 +13,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from lang3dxl_ns.query.relevancy import Queries
@@ -42,11 +41,6 @@ BEST = 0.005
 """Share of the Gaussians that a prompt's peak is the mean of."""
 _AT_A_TIME = 4
 """Number of unrelated words that are queried together."""
-EVEN = 0.5
-"""Relevancy where prompt and negatives match equally well."""
-SHARE = 0.3
-"""Where matches begin, as a fraction of the way from the median Gaussian's relevancy to a prompt's peak.
-Tuned on the validation landmarks (docs/lab/words.md)."""
 
 
 @dataclass(frozen=True)
@@ -98,25 +92,3 @@ def doubtful(text: str, doubt: float, taught: bool = False) -> str | None:
         fit = f"{doubt:.0%} of unrelated words fit this scene as well as {text!r}"
         why = f"{fit}: it may not be here, {unknown}"
     return f"doubtful: {why}"
-
-
-def match_thresholds(
-    relevancy: Float[Tensor, "q n"], doubts: Sequence[float], named: Sequence[bool]
-) -> tuple[float, ...]:
-    """Compute for each prompt the relevancy above which Gaussians match.
-
-    Small and thin things blur with their surroundings in CLIP's crops, and seldom beat every negative there.
-    So the threshold is relative to the scene, and never above `EVEN`. Doubtful prompts use `EVEN`, because
-    their peaks carry no information. So do the `named` ones, which have negatives of their own to beat.
-    """
-    if relevancy.shape[1] == 0:
-        return (EVEN,) * len(relevancy)
-    low = relevancy.median(dim=1).values
-    levels = (low + SHARE * (peaks(relevancy) - low)).clamp_max(EVEN).tolist()
-    strict = [doubt > DOUBTFUL or names for doubt, names in zip(doubts, named, strict=True)]
-    return tuple(EVEN if one else level for one, level in zip(strict, levels, strict=True))
-
-
-def matching(maps: Float[Tensor, "q ..."], thresholds: Sequence[float]) -> Bool[Tensor, "q ..."]:
-    """Return where each prompt's relevancy exceeds its threshold."""
-    return maps > maps.new_tensor(list(thresholds)).view(-1, *[1] * (maps.dim() - 1))

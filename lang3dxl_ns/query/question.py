@@ -17,11 +17,11 @@ from torch import Tensor
 from lang3dxl_ns.common.checks import check_numbers
 from lang3dxl_ns.common.image import resize_nearest
 from lang3dxl_ns.common.settings_help import showing
-from lang3dxl_ns.query.doubt import matching
 from lang3dxl_ns.query.engine import QueryEngine
 from lang3dxl_ns.query.heat_maps import overlay, strongest
 from lang3dxl_ns.query.relevancy import TEMPERATURE, Queries
 from lang3dxl_ns.query.text import Prompt, TextConfig
+from lang3dxl_ns.query.thresholds import matching
 from lang3dxl_ns.query.trust import Trust
 from lang3dxl_ns.rendering import Rendering
 

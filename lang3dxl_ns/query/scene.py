@@ -25,13 +25,14 @@ from lang3dxl_ns.files.splat_file import write_matching, write_splats
 from lang3dxl_ns.preparation.encoders import load_image_text_encoder
 from lang3dxl_ns.query import answer
 from lang3dxl_ns.query.answering import Place
-from lang3dxl_ns.query.doubt import DOUBTFUL, Doubts, doubtful, match_thresholds, matching, peaks
+from lang3dxl_ns.query.doubt import DOUBTFUL, Doubts, doubtful, peaks
 from lang3dxl_ns.query.engine import QueryEngine, make_engine
 from lang3dxl_ns.query.floaters import FLOATS, floating
 from lang3dxl_ns.query.match import Found, Match, View
 from lang3dxl_ns.query.question import QueryConfig, Question
 from lang3dxl_ns.query.relevancy import Queries
 from lang3dxl_ns.query.text import EncodeTexts, Prompt, TextEncoder, listed_phrases, parse_prompts, texts_of
+from lang3dxl_ns.query.thresholds import match_thresholds, matching
 from lang3dxl_ns.query.trust import ANCHORS, alike, foreignness, judged
 from lang3dxl_ns.query.visibility import VisibleGaussians, measured, median_distance, total_pixels
 from lang3dxl_ns.query.vocabulary import closest_word, common_words, searched, shipped_vocabulary

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from lang3dxl_ns.query.doubt import EVEN, SHARE, match_thresholds
+from lang3dxl_ns.query.thresholds import EVEN, SHARE, match_thresholds
 
 
 def scene(level: float, peak: float, count: int = 1_000, share: float = 0.02) -> torch.Tensor:
