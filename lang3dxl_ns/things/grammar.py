@@ -164,19 +164,20 @@ def answer(request: Request, found: Sequence[Things], sight: Facing) -> list[Thi
     return chosen
 
 
-def unsure(request: Request, found: Sequence[Things], sight: Callable[[list[Thing]], Sight]) -> str | None:
+def unsure(request: Request, found: Sequence[Things], sight: Facing) -> str | None:
     """Tell what may make an answer wrong; None if nothing does. Arguments are those of `answer`.
 
     The answer has to be the same without the things that few photos show, and with all candidates. Sizes are
     known roughly: where the next thing is nearly as large, either may be the largest.
     """
+
+    def with_things(one: Things, things: list[Thing]) -> list[Things]:
+        return [replace(other, things=things) if other is one else other for other in found]
+
     wide = []
-    for one in found:
+    for one in (one for one in found if one.word in request.words):
         ways = (one.things, one.sure, [*one.things, *one.candidates])
-        told = {
-            _told(request, [replace(o, things=way) if o is one else o for o in found], sight) for way in ways
-        }
-        if one.word in request.words and len(told) > 1:
+        if len({_told(request, with_things(one, things), sight) for things in ways}) > 1:
             wide.append(f"{one.word}: {one.count}")
     return ", ".join(wide) or _close(request, found, sight)
 
@@ -188,15 +189,14 @@ def _told(request: Request, found: Sequence[Things], sight: Facing) -> int | fro
     return None
 
 
-def _close(request: Request, found: Sequence[Things], sight: Callable[[list[Thing]], Sight]) -> str | None:
+def _close(request: Request, found: Sequence[Things], sight: Facing) -> str | None:
     kind, sign = table()["superlatives"].get(request.superlative, ("left", 1))
     if kind in ("left", "top") or _told(request, found, sight) is None:
         return None
     listed = answer(replace(request, superlative=None), found, sight)
-    first = sorted((measure(thing, kind, sight(listed)) for thing in listed), key=lambda size: sign * size)[
-        :2
-    ]
-    close = len(first) == 2 and max(first) < CLOSE * min(first)
+    view = sight(listed)
+    sizes = sorted((measure(thing, kind, view) for thing in listed), key=lambda size: sign * size)[:2]
+    close = len(sizes) == 2 and max(sizes) < CLOSE * min(sizes)
     return f"another {request.word} measures nearly the same" if close else None
 
 

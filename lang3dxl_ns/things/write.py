@@ -127,5 +127,8 @@ def write_things(scene: Scene, answers: Sequence[Things], folder: Path, look: st
 
 
 def _each_once(answers: Sequence[Things]) -> list[Thing]:
-    every = [thing for one in answers for thing in one.things]
-    return [thing for i, thing in enumerate(every) if thing.id not in {other.id for other in every[:i]}]
+    things: dict[int, Thing] = {}
+    for one in answers:
+        for thing in one.things:
+            things.setdefault(thing.id, thing)
+    return list(things.values())
