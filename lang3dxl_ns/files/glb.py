@@ -54,16 +54,11 @@ def encode_glb(
     local: dict[str, Any] = {_SPLATS: {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}}
     shared = dict[str, Any]()
     if things:
-        sets = list[dict[str, Any]]()
-        for word in dict.fromkeys(thing.word for thing in things):
-            ids, number = np.full(len(splats), len(things), np.float32), len(sets)
-            for i in np.argsort([-thing.size.prod() for thing in things]):  # small ones over large ones
-                ids[things[i].rows if things[i].word == word else []] = i
+        features = list(_feature_sets(things, len(splats)))
+        for number, (ids, _) in enumerate(features):
             named[f"_FEATURE_ID_{number}"] = file.attribute(ids[sound.cpu().numpy()])
-            told = {"featureCount": len(set(ids) - {len(things)}), "nullFeatureId": len(things)}
-            label = re.sub(r"\W", "_", f"_{word}", flags=re.ASCII)
-            sets.append({**told, "attribute": number, "propertyTable": 0, "label": label})
-        local[_FEATURES], shared[_METADATA] = {"featureIds": sets}, _table(file, things)
+        local[_FEATURES] = {"featureIds": [described for _, described in features]}
+        shared[_METADATA] = _table(file, things)
     if record is not None:
         shared[_RECORD] = {"bufferView": file.view(record)}
     node: dict[str, Any] = {"mesh": 0}
@@ -113,6 +108,19 @@ class _Writer:
         ends = {"min": rows.min(0).tolist(), "max": rows.max(0).tolist()}
         self.accessors.append(accessor | ends | {"count": len(rows), "type": kind})
         return len(self.accessors) - 1
+
+
+def _feature_sets(
+    things: Sequence[Thing], count: int
+) -> Iterator[tuple[Float32[Array, " n"], dict[str, Any]]]:
+    """Yield for each word the feature ids of the Gaussians, rows of `_table`, and what tells of them."""
+    ids = {thing.word: np.full(count, len(things), np.float32) for thing in things}
+    for i in np.argsort([-thing.size.prod() for thing in things]):  # small ones over large ones
+        ids[things[i].word][things[i].rows] = i
+    for number, (word, rows) in enumerate(ids.items()):
+        label = re.sub(r"\W", "_", f"_{word}", flags=re.ASCII)
+        told = {"featureCount": len(np.unique(rows[rows < len(things)])), "nullFeatureId": len(things)}
+        yield rows, {**told, "attribute": number, "propertyTable": 0, "label": label}
 
 
 def _table(file: _Writer, things: Sequence[Thing]) -> dict[str, Any]:

@@ -21,6 +21,12 @@ from lang3dxl_ns.query.question import Question
 from lang3dxl_ns.rendering import Splats
 from lang3dxl_ns.scene.georeference import Georeference
 
+_WRITERS: dict[str, Callable[[Splats, Tensor | None, Georeference | None], bytes]] = {
+    ".ply": lambda splats, relevancy, place: encode_ply(splats, relevancy, f"{place or ''}"),
+    ".spz": lambda splats, *_: encode_spz(splats),
+    ".sog": lambda splats, *_: encode_sog(splats),
+    ".glb": lambda splats, _, place: encode_glb(splats, place=place),
+}
 SPLAT_NAMES = ".ply, .spz, .sog or .glb"
 
 
@@ -37,11 +43,7 @@ def write_splats(
     check_splat_name(path)
     sound = splats.sound()
     splats, relevancy = splats.select(sound), None if relevancy is None else relevancy[sound]
-    writers: dict[str, Callable[[Splats], bytes]] = {
-        ".ply": partial(encode_ply, relevancy=relevancy, comment=f"{place or ''}"),
-        **{".glb": partial(encode_glb, place=place), ".spz": encode_spz, ".sog": encode_sog},
-    }
-    write_atomically(path, writers[path.suffix.lower()](splats))
+    write_atomically(path, _WRITERS[path.suffix.lower()](splats, relevancy, place))
     return len(splats)
 
 
@@ -87,5 +89,5 @@ def check_splat_name(path: Path) -> None:
     """Raise UserError if the path is a folder, or its name ends in none of `SPLAT_NAMES`."""
     if path.is_dir():
         raise UserError(f"{path} is a folder: name a {SPLAT_NAMES} file in it")
-    if path.suffix.lower() not in (".ply", ".spz", ".sog", ".glb"):
+    if path.suffix.lower() not in _WRITERS:
         raise UserError(f"{path.name} names no kind of splat file: end it in {SPLAT_NAMES}")
