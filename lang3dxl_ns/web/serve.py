@@ -112,7 +112,7 @@ class Handler(BaseHTTPRequestHandler):
         # Browsers name the origin of every POST; other sites can't send JSON without asking first.
         ours = self.headers.get("Origin") and self.headers.get("Content-Type") == _KINDS["json"]
         page, path = self.server.page, urlsplit(self.path).path
-        keep = {"/api/teach": page.teach, "/api/tour": page.own_words.keep_tour}.get(path)
+        keep = {"/api/teach": page.teach, "/api/tour": page.keep_tour}.get(path)
         if keep is None or not ours or not 0 < size <= _MOST_MARKS:
             self.close_connection = True  # what was sent is not read
             raise UserError("this server takes the marks of a word from its own page alone")

@@ -49,13 +49,15 @@ class PageWords:
                 )
         return scene, told
 
-    def keep_tour(self, content: Mapping[str, Any]) -> None:
-        """Keep a page's tour in the scene file, if there is one. Raises UserError for other content."""
+    def keep_tour(self, content: Mapping[str, Any]) -> str:
+        """Keep a page's tour in the scene file, if there is one, and return it. Raises UserError for other
+        content."""
         if not isinstance(content, dict) or not isinstance(tour := content.get("tour"), str):
             raise UserError("this is no tour: load the page again")
         if self.file is not None:
             with self._one, locked(self.file.resolve().parent):
                 keep_words(self.file, {}, tour)
+        return tour
 
     def _taught(self, scene: Scene, name: str, before: str, examples: Sequence[Example]) -> tuple[Scene, str]:
         for former in {known_word(before), known_word(name)}:

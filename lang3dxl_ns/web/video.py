@@ -74,7 +74,8 @@ def write_video(path: Path, scene: Scene, shots: Sequence[Shot]) -> int:
     first, path = shots[0][0], expanded(path).absolute()
     partial = path.with_name(f"{path.stem}.{os.getpid()}{path.suffix}")
     read = f"-f rawvideo -pix_fmt rgb24 -r {RATE} -s {first.width}x{first.height} -i -"
-    command = ["ffmpeg", "-loglevel", "error", *read.split(), "-pix_fmt", "yuv420p", f"{partial}"]
+    even = "-vf pad=ceil(iw/2)*2:ceil(ih/2)*2 -pix_fmt yuv420p"  # which most players and codecs want
+    command = ["ffmpeg", "-loglevel", "error", *read.split(), *even.split(), f"{partial}"]
     try:
         with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as process:
             with suppress(BrokenPipeError):  # ffmpeg says why

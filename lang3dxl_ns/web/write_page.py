@@ -7,7 +7,7 @@ import hashlib
 import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -22,12 +22,13 @@ from lang3dxl_ns.common.files import make_folder, replace_file
 from lang3dxl_ns.common.pictures import PHOTO_SUFFIXES
 from lang3dxl_ns.files.scene_file import Provenance
 from lang3dxl_ns.query import view_ranking
-from lang3dxl_ns.query.doubt import BEST, DOUBTFUL, DOUBTFUL_TAUGHT, EVEN, LEAST_PEAK, SHARE
+from lang3dxl_ns.query.doubt import BEST, DOUBTFUL, DOUBTFUL_TAUGHT, LEAST_PEAK
 from lang3dxl_ns.query.heat_maps import PROMPT_COLORS
 from lang3dxl_ns.query.language import TABLE, phrases_of
 from lang3dxl_ns.query.negatives import CLEAR, NOTHING, competitors
 from lang3dxl_ns.query.scene import NO_SEMANTICS, Scene
 from lang3dxl_ns.query.text import Prompt, tidy
+from lang3dxl_ns.query.thresholds import EVEN, SHARE
 from lang3dxl_ns.query.trust import ALIKE, ANCHORS, CLEARLY, FAINT, FAR, STRICTER, STRICTEST
 from lang3dxl_ns.query.visibility import spread
 from lang3dxl_ns.query.vocabulary import closest_word, common_words, same_thing, shipped_vocabulary
@@ -322,6 +323,10 @@ class Page:
         self.whole, told = self.own_words.teach(self.whole, content)
         self.scene = self.scene.with_words(self.whole.words.values()) if self.levels else self.whole
         return {"told": told}
+
+    def keep_tour(self, content: Mapping[str, Any]) -> None:
+        """Keep a tour, which the page then opens with; see `PageWords.keep_tour`."""
+        self.provenance = replace(self.provenance, tour=self.own_words.keep_tour(content))
 
     def photo(self, name: str) -> bytes:
         """Read a small copy of a photo. Raises UserError if there is none."""

@@ -121,6 +121,18 @@ def test_what_is_no_tour_is_not_kept(content):
         PageWords().keep_tour(json.loads(content))
 
 
+def test_a_page_that_is_served_opens_with_the_tour_kept_last():
+    page = Page(painted_scene(), live=True)
+    page.keep_tour({"tour": TOUR})
+    assert json.loads(page.files()["scene.json"])["tour"] == TOUR
+
+
+def test_a_video_may_have_sides_of_any_length(tmp_path):
+    scene = painted_scene()
+    assert write_video(tmp_path / "odd.mp4", scene, [(*tour_shots(scene, TOUR, (97, 63))[0][:3], 1)]) == 1
+    assert (tmp_path / "odd.mp4").stat().st_size > 500
+
+
 def test_a_video_flies_through_the_tour(tmp_path):
     scene = painted_scene()
     shots = tour_shots(scene, TOUR, (96, 64))
