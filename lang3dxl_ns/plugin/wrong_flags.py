@@ -20,14 +20,13 @@ def name_wrong_flags(settings: Any) -> None:
     parse: Any = tyro.cli
 
     def parsed(*kinds: Any, **options: Any) -> Any:
-        with redirect_stderr(io.StringIO()) as said:
-            try:
+        said = io.StringIO()
+        try:
+            with redirect_stderr(said):
                 return parse(*kinds, **options)
-            except SystemExit as error:
-                code = error.code
-        found = re.search(r"Unrecognized options: (--[^\s,]+)", said.getvalue())
-        sys.stderr.write(wrong_flag(settings, sys.argv[1:], found[1]) if found else said.getvalue())
-        sys.exit(code)
+        finally:
+            found = re.search(r"Unrecognized options: (--[^\s,]+)", said.getvalue())
+            sys.stderr.write(wrong_flag(settings, sys.argv[1:], found[1]) if found else said.getvalue())
 
     tyro.cli = parsed
 

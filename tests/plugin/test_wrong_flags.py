@@ -41,3 +41,9 @@ def test_all_flags_that_tyro_knows_are_right(monkeypatch, capsys):
         tyro.cli(type(SETTINGS.machine), args=["--seed", "x"])
     assert "--seed" in capsys.readouterr().err
     assert tyro.cli(type(SETTINGS.machine), args=["--seed", "3"]).seed == 3
+
+
+def test_what_is_said_beside_a_right_command_line_stays(monkeypatch, capsys):
+    monkeypatch.setattr(tyro, "cli", lambda *_, **__: print("a warning", file=sys.stderr) or 3)
+    name_wrong_flags(SETTINGS)
+    assert tyro.cli() == 3 and capsys.readouterr().err == "a warning\n"
