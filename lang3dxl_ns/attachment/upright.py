@@ -49,16 +49,12 @@ class Upright:
 
 
 def find_up(solid: Splats, center: Float[Tensor, "3"], radius: float) -> Upright:
-    """Find the up direction of a scene from its opaque Gaussians.
+    """Find the up direction of a scene from its opaque Gaussians, three quarters of which lie within `radius`
+    of its `center`.
 
     The three dominant directions of its surfaces are candidates, upwards and downwards. A vertical axis has
     walls all around. In views with the right one up, the sky is above, doors are below, and crops look like
     what words name; the built-in CLIP judges that.
-
-    Args:
-        solid: opaque Gaussians.
-        center: the scene's middle.
-        radius: distance from the middle that holds three quarters of the matter.
     """
     solid = _thinned(solid.select((solid.means - center).norm(dim=1) < _NEAR * radius))
     judge = _Judge(load_image_text_encoder(BUILTIN, solid.means.device))

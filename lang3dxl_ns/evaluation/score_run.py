@@ -145,18 +145,9 @@ def score_photos(
     scorer: LanguageScorer | None = None,
     fits_looks: bool = False,
 ) -> Iterator[EvaluatedPhoto]:
-    """Render photos and score them, with a progress bar.
-
-    Args:
-        run: what is scored, as it is now.
-        data: the photos, which need not be the run's own, in its frame.
-        names: photos to score.
-        scorer: scores words; None leaves them out.
-        fits_looks: whether the half-image protocol is applied.
-
-    Raises:
-        UserError: no photo can be read, or words are to be scored and the run has none yet.
-    """
+    """Render photos by name as the run shows them now, and score them, with a progress bar. They need not be
+    the run's own, but are in its frame. `scorer` scores words, and `fits_looks` applies the half-image
+    protocol. Raises UserError if no photo can be read, or if words are wanted that the run does not have."""
     photos = _Photos(run, data, scorer)
     if scorer is not None:
         photos.lift_labels(names)

@@ -30,19 +30,9 @@ def load_run(
     config: QueryConfig | None = None,
     clip: str | None = None,
 ) -> Scene:
-    """Load the scene of a run from its latest checkpoint.
-
-    Args:
-        run: the run's folder, a folder above it (the newest run there is taken), or its config.yml; None: the
-            newest run under outputs/. The file is loaded without executing code (nerfstudio's own commands,
-            such as ns-eval, do trust it).
-        device: default: a GPU if there is one.
-        config: defaults of queries.
-        clip: name or folder of the run's CLIP, if it is not where the run says.
-
-    Raises:
-        UserError: the folder has no checkpoint, or the run is damaged or of another method.
-    """
+    """Load the scene of a run (see `find_config`) from its latest checkpoint; other arguments are those of
+    `load_scene`. config.yml is read without executing code; nerfstudio's own commands do trust it. Raises
+    UserError if the folder has no checkpoint, or the run is damaged or of another method."""
     place, worker = find_config(run), known_device(device)
     settings, checkpoints = read_model_config(place)
     folder, file = place.parent, SceneRecord.read(place.parent / SCENE_FILE)

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import zipfile
-import zlib
 from pathlib import Path
 from typing import Any
 
-from lang3dxl_ns.common.errors import UserError, readable
+from lang3dxl_ns.common.errors import DAMAGE, UserError, readable
 from lang3dxl_ns.common.files import check_regular
 from lang3dxl_ns.training.checkpoint import NOT_A_CHECKPOINT, load_checked
 
@@ -43,7 +42,7 @@ def check_checkpoint(place: Path) -> None:
         with zipfile.ZipFile(checkpoints[-1]) as archive:
             packed = any(part.compress_type != zipfile.ZIP_STORED for part in archive.infolist())
             damaged = "packed, as torch writes none" if packed else archive.testzip()
-    except (zipfile.BadZipFile, EOFError, OSError, ValueError, NotImplementedError, zlib.error):
+    except DAMAGE:
         damaged = "the whole file"
     if damaged is not None:
         raise UserError(

@@ -32,13 +32,8 @@ _SIZE, _FRONT, _SEEN, _BIAS = 2.2, 5.0, 3.0, -6.8
 def floating(
     splats: Splats, views: Mapping[str, VisibleGaussians], draw: Callable[[Camera], Rendering]
 ) -> Float[Tensor, " n"]:
-    """Compute how surely each Gaussian is a floater, 0…1.
-
-    Args:
-        splats: the Gaussians, in the frame of the cameras.
-        views: the Gaussians visible in each training view, as `Scene.visible` measures them.
-        draw: renders a camera with its depth.
-    """
+    """Compute how surely each Gaussian is a floater, 0…1. `views` are the Gaussians visible in each training
+    view, as `Scene.visible` measures them; `draw` renders a camera with its depth."""
     count, device = len(splats), splats.means.device
     before, on, inside, seen = (torch.zeros(count, device=device) for _ in range(4))
     for view in views.values():

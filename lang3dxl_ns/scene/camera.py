@@ -119,13 +119,8 @@ _UNIT = 0.01
 
 def rigid(rows: Any) -> tuple[Float64[Array, "3 4"], float]:
     """Read a pose from a file: a [3, 4] or [4, 4] nested list of finite numbers. Its rotation may be scaled.
-
-    Returns:
-        the pose with the nearest rotation, and the scale of the given one.
-
-    Raises:
-        ValueError: it is something else, such as mirrored or stretched in one direction.
-    """
+    Return it with the nearest rotation, and the scale. Raises ValueError for anything else, such as a pose
+    that is mirrored or stretched in one direction."""
     in_rows = isinstance(rows, list) and all(isinstance(row, list) and len(row) == 4 for row in rows)
     numbers = in_rows and all(is_coordinate(value) for row in rows for value in row)
     expect(numbers and len(rows) in (3, 4), "a pose is not three rows of four numbers")
