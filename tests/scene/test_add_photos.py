@@ -103,7 +103,7 @@ def test_a_photo_of_another_size_finds_its_own_lens(scene):
 
 def test_the_report_and_the_picture_know_the_new_photos(scene, monkeypatch):
     work = scene / "data/lang3dxl_cache/reconstruction"
-    before, doubted = (work / "cameras.png").read_bytes(), doubtful_photos(work.parent)  # COLMAP may doubt one
+    before, doubted = (work / "cameras.png").read_bytes(), doubtful_photos(work.parent)
     monkeypatch.setattr(module, "doubtful_placements", lambda *_: dict.fromkeys(range(1, 8), "it looks away"))
     add_photos(scene / "data", scene / "late", None, SIFT)
     added = {f"late/{name}": "it looks away" for name in LATE}
