@@ -362,7 +362,8 @@ def test_a_conversation_in_the_viewer(default, gpu):
 
     from scenes import view_of
 
-    from lang3dxl_ns.plugin.conversation import Conversation
+    from lang3dxl_ns.training.conversation import Conversation
+    from lang3dxl_ns.training.snapshot import snapshot
 
     pipeline = default.pipeline
     model = pipeline.model.eval()
@@ -376,7 +377,7 @@ def test_a_conversation_in_the_viewer(default, gpu):
         camera = pipeline.scene_file.photos[0].camera
         outputs = model.get_outputs_for_camera(view_of(camera))
         assert all(value.device == CUDA for value in outputs.values())
-        assert model.scene(pipeline.scene_file).baked().means.device == CUDA
+        assert snapshot(model.run, pipeline.scene_file).baked().means.device == CUDA
         model.answers = None
 
 

@@ -17,6 +17,7 @@ from lang3dxl_ns.evaluation.ground_truth import GroundTruth
 from lang3dxl_ns.evaluation.label_limit import Masks, lifted_labels
 from lang3dxl_ns.evaluation.layouts import Truth
 from lang3dxl_ns.evaluation.scores import LanguageScorer, map_size, overlap
+from lang3dxl_ns.query.answer import relevancy_maps
 from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.query.text import Prompt
 from lang3dxl_ns.query.view_ranking import Box, groups, shared_volume
@@ -47,7 +48,7 @@ def score_scene(
         size, keep = truth.scoring_size(height, width), photo.foreground()
         keep = None if keep is None else keep.to(scene.device)
         raw, published = (
-            scorer.named(scene.relevancy_maps(photo.camera, queries.to(scene.device)), size)
+            scorer.named(relevancy_maps(scene, photo.camera, queries.to(scene.device)), size)
             for queries in (queries_shown, scorer.published_queries)
         )
         variants = scorer.variants(raw, keep, scene.engine.temperature, published)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 import torch
 from jaxtyping import Float
@@ -18,6 +19,7 @@ from lang3dxl_ns.query.question import Question
 from lang3dxl_ns.query.relevancy import Queries
 from lang3dxl_ns.query.view_ranking import Viewpoint, rank_views, strongest_match
 from lang3dxl_ns.rendering import composite
+from lang3dxl_ns.rendering.gathering import filled_pixels
 from lang3dxl_ns.scene.camera import Camera, resized
 
 
@@ -106,7 +108,7 @@ def words_at(
         raise UserError(f"{x}, {y} lies outside the view of {camera.width} × {camera.height} pixels")
     pixel = torch.zeros(camera.height, camera.width, device=scene.device)
     pixel[int(y), int(x)] = 1.0
-    share = scene.fill(camera, pixel)
+    share = filled_pixels(partial(composite, scene.splats, camera), pixel, len(scene.splats))
     rows = share.nonzero().squeeze(1)
     features = scene.engine.features(rows)
     if not words or float(share[rows] @ (features != 0).any(1).float()) < scene.config.min_alpha:

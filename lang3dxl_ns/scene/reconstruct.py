@@ -27,7 +27,7 @@ from lang3dxl_ns.common.errors import DAMAGE, UserError, is_plain
 from lang3dxl_ns.common.files import expanded, locked, read_json, replace_file
 from lang3dxl_ns.common.memory import machine_memory
 from lang3dxl_ns.common.pictures import open_picture
-from lang3dxl_ns.common.reports import measure, part
+from lang3dxl_ns.common.reports import timed
 from lang3dxl_ns.scene.camera_picture import camera_picture
 from lang3dxl_ns.scene.colmap import load_pycolmap
 from lang3dxl_ns.scene.companions import cache_folder
@@ -88,14 +88,15 @@ def reconstruct(
     say(f"{len(photos.names)} photos in {photos.folder}, without a COLMAP model: reconstructing")
     good, left_out = usable(photos)
     _check_enough(photos, good, left_out)
-    with quiet(), measure() as clock:
-        with part("features"):
+    spent: dict[str, float] = {}
+    with quiet():
+        with timed(spent, "features"):
             copies = numbered(good, work)
             database = feature_database(good, copies, work, settings)
             extract(database, copies, settings)
-        with part("matching"):
+        with timed(spent, "matching"):
             match(database, copies.names, settings)
-        with part("mapping"):
+        with timed(spent, "mapping"):
             models, contradicting = _map(database, copies, work, settings.mapper), 0
             if models and len(_doubts(database, models[0])) > _DOUBTED * models[0].num_reg_images():
                 models, contradicting = _map_consistent(database, models, copies, work, settings.mapper)
@@ -115,7 +116,7 @@ def reconstruct(
         mapper=settings.mapper, contradicting=contradicting, doubtful=doubtful,
         left_out=left_out | {names[number]: why for number, why in reasons.items()},
         other_models=tuple(other.num_reg_images() for other in models[1:]),
-        seconds={stage: round(sum(spent), 1) for stage, spent in clock.items()},
+        seconds={stage: round(seconds, 1) for stage, seconds in spent.items()},
     )  # fmt: skip
     _publish(models, model)
     write_picture(best, doubtful, work)

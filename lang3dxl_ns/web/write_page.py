@@ -26,8 +26,8 @@ from lang3dxl_ns.query.doubt import BEST, DOUBTFUL, DOUBTFUL_TAUGHT, LEAST_PEAK
 from lang3dxl_ns.query.heat_maps import PROMPT_COLORS
 from lang3dxl_ns.query.language import TABLE, phrases_of
 from lang3dxl_ns.query.negatives import CLEAR, NOTHING, competitors
-from lang3dxl_ns.query.scene import NO_SEMANTICS, Scene
-from lang3dxl_ns.query.text import Prompt, tidy
+from lang3dxl_ns.query.scene import Scene
+from lang3dxl_ns.query.text import NO_SEMANTICS, Prompt, tidy
 from lang3dxl_ns.query.thresholds import EVEN, SHARE
 from lang3dxl_ns.query.trust import ALIKE, ANCHORS, CLEARLY, FAINT, FAR, STRICTER, STRICTEST
 from lang3dxl_ns.query.visibility import spread

@@ -16,8 +16,8 @@ from torch import Tensor
 
 from lang3dxl_ns.query.match import Found
 from lang3dxl_ns.query.question import QueryConfig, Question, pictures
-from lang3dxl_ns.query.scene import Scene, text_encoder
-from lang3dxl_ns.query.text import EncodeTexts, caution
+from lang3dxl_ns.query.scene import Scene
+from lang3dxl_ns.query.text import EncodeTexts, caution, text_encoder
 from lang3dxl_ns.rendering import Rendering
 from lang3dxl_ns.scene.record import SceneRecord
 from lang3dxl_ns.things.find import Things, things_of
