@@ -19,6 +19,7 @@ from lab.baselines import BASELINES, langsplat
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.components.compression import CompressedField
 from lang3dxl_ns.open_scene import load_scene
+from lang3dxl_ns.query.ask import prompts_of
 from lang3dxl_ns.scene.capture import open_capture
 from lang3dxl_ns.training import estimate, fit, gaussians
 from lang3dxl_ns.training.step import decoded_side, losses
@@ -314,7 +315,7 @@ def test_words_on_the_gpu_are_those_on_the_cpu(default, gpu):
     with gpu():
         found = gathered("cuda")
         scene = load_scene(default.base_dir / "config.yml")
-        queries = scene.queries(scene.prompts("tower; window"))
+        queries = scene.queries(prompts_of(scene, "tower; window"))
         relevancy, temperature = scene.engine.of_gaussians(queries).cpu(), scene.engine.temperature
         codes = default.pipeline.model.gauss_params["codes"].detach().cpu()
         field = default.pipeline.model.semantic_field

@@ -6,6 +6,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
+from statistics import median_high
 
 import torch
 from jaxtyping import Float
@@ -34,7 +35,8 @@ def matches(scene: Answering, question: Question, place: Place, size: int | None
     channels = question.channels
     asked = time.perf_counter()
     camera = scene.camera(place, size)
-    small = resized(camera, scene.trained_side)
+    sides = [max(photo.camera.width, photo.camera.height) for photo in scene.photos if photo.split == "train"]
+    small = resized(camera, median_high(sides)) if sides else camera
     enlarged = small.width < camera.width
     view = scene.view(place, camera, channels=None if enlarged else channels)
     rendered, rendering = time.perf_counter(), view.rendering

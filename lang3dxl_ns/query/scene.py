@@ -285,10 +285,6 @@ class Scene:
         question = self.ask(texts, negatives=negatives, threshold=threshold)
         return _one_or_all(texts, answer.locate(self, question, most))
 
-    def places(self, question: Question, most: int = 10) -> list[Found]:
-        """Find matches of a question's prompts in the scene; see `find`."""
-        return answer.locate(self, question, most)
-
     def relevancy(self, text: Text) -> Float[Array, " n"]:
         """Compute the relevancy of every Gaussian to one prompt, 0…1; 0 for Gaussians visible in no photo.
         Raises UserError as `ask` does, and for a text that holds several prompts."""
@@ -352,12 +348,6 @@ class Scene:
     def floating(self) -> Float[Tensor, " n"]:
         """How surely each Gaussian is a floater, 0…1."""
         return floating(self.splats, self.visible, self.draw)
-
-    @cached_property
-    def trained_side(self) -> int:
-        """Median of the training photos' longer sides in pixels."""
-        sides = sorted(max(p.camera.width, p.camera.height) for p in self.photos if p.split == "train")
-        return sides[len(sides) // 2] if sides else LARGEST
 
     @cached_property
     def gap(self) -> float:
@@ -442,10 +432,6 @@ class Scene:
         return least_certain_photo(self, word)
 
     # ── prompts ─────────────────────────────────────────────────────────────────────────────────────
-
-    def prompts(self, texts: Text | Sequence[Text]) -> list[Prompt]:
-        """Parse prompts, and attach the taught words. Raises UserError if there are no prompts."""
-        return asking.prompts_of(self, texts)
 
     def queries(self, prompts: Sequence[Prompt]) -> Queries:
         """Encode prompts on the scene's device. Only texts that the scene doubts get their synonyms: where

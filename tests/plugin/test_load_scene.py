@@ -149,7 +149,8 @@ def test_the_files_frame_leads_back_to_colmaps(scene, trainer):
 def test_a_query_is_what_evaluation_scores(scene, trainer, tiny_clip):
     """The same words, vectors and formula as ns-eval's average precision, at the size of training."""
     scorer = open_scorer(SimpleNamespace(categories=["dome", "door"]), str(tiny_clip), "cpu")
-    model, camera = trainer.pipeline.model, scene.camera("photo_003.jpg", size=scene.trained_side)
+    side = min(max(photo.camera.width, photo.camera.height) for photo in scene.photos)
+    model, camera = trainer.pipeline.model, scene.camera("photo_003.jpg", size=side)
     maps = relevancy_maps(snapshot(model.run, scene.file), camera, scorer.queries)
     for match, expected in zip(scene.query("dome; door", camera), maps, strict=True):
         seen = match.view.alpha >= scene.config.min_alpha
