@@ -16,7 +16,7 @@ from lang3dxl_ns.query.answering import Answering
 from lang3dxl_ns.query.doubt import doubtful, peaks
 from lang3dxl_ns.query.question import Question
 from lang3dxl_ns.rendering import composite
-from lang3dxl_ns.things.join import VIEWS, Joined, join, stacked, without_crumbs
+from lang3dxl_ns.things.join import VIEWS, Joined, grown, join, stacked, without_crumbs
 from lang3dxl_ns.things.pieces import FILLED, LEVELS, Piece, Shown, pieces_of
 from lang3dxl_ns.things.thing import Box, Sighting, Thing, upright_box
 
@@ -24,6 +24,9 @@ COLORED = 20
 """Number of Gaussians within and around the matches below which colors tell nothing."""
 SAMPLED = 50_000
 """Number of Gaussians, each of matches and of others, from which only every second one tells colors."""
+PAIRED, NEIGHBORS = 1_000, 3.0
+"""Number of Gaussians, about, whose directions from each other tell where walls run, and their largest
+distance, relative to the gap between groups."""
 _KNOWN: WeakKeyDictionary[Answering, list[Thing]] = WeakKeyDictionary()
 """Things that were found in each scene so far: they keep their ids."""
 SAME = 0.5
@@ -73,7 +76,7 @@ def things_of(scene: Answering, question: Question) -> list[Things]:
     scene found keeps its id.
     """
     mass = scene.mass.double().cpu().numpy()
-    means, up = scene.splats.means.double().cpu().numpy(), up_of(scene)
+    means, axes = scene.splats.means.double().cpu().numpy(), axes_of(scene)
     sharp = [_sharpened(scene, relevancy) for relevancy in question.relevancy]
     # A word whose peak stays below the lowest level names nothing here.
     present = (peaks(question.relevancy) > LEVELS[0]).tolist()
@@ -83,18 +86,17 @@ def things_of(scene: Answering, question: Question) -> list[Things]:
             found += pieces_of(shown) if there else []
 
     def box(one: Joined, weight: Float[Array, " n"]) -> Box:
-        return upright_box(means[one.rows], weight[one.rows], up)
+        return upright_box(means[one.rows], weight[one.rows], axes)
 
     answers, known = list[Things](), _KNOWN.setdefault(scene, [])
     for i, prompt in enumerate(question.prompts):
         values = question.relevancy[i].double().cpu().numpy()
         weight = np.sqrt(mass) * values
         parts = join(pieces[i], weight)
-        joined = stacked(parts, [box(part, weight) for part in parts])
+        joined = grown(stacked(parts, [box(part, weight) for part in parts]), len(weight))
         sure = [one for one in without_crumbs(joined) if one.views >= VIEWS]
-        listed = [_thing(prompt.text, one, box(one, weight), mass, values)
+        listed = [_known(_thing(prompt.text, one, box(one, weight), mass, values), known, mass)
                   for one in [*sure, *(one for one in joined if one not in sure)]]  # fmt: skip
-        listed = [_known(thing, known, mass) for thing in listed]
         things, candidates = listed[: len(sure)], listed[len(sure) :]
         known += [thing for thing in things if all(thing.id != other.id for other in known)]
         caution = doubtful(prompt.text, question.doubts[i], prompt.taught is not None)
@@ -108,6 +110,20 @@ def up_of(scene: Answering) -> Float[Array, "3"]:
     up = np.array([photo.camera_to_world for photo in scene.photos])[:, :, 1].mean(0)
     up = up if told is None else np.asarray(told.up, dtype=np.float64)
     return up / max(np.linalg.norm(up), 1e-9)
+
+
+def axes_of(scene: Answering) -> Float[Array, "3 3"]:
+    """Return the directions of all boxes' edges, one a row: along the walls, across them, and up. Walls
+    seen from above are lines, a quarter turn apart: Gaussians on one lie in its direction from each other."""
+    up = up_of(scene)
+    plane = np.linalg.svd(up[None])[2][1:]
+    heavy = (scene.mass > scene.mass.median() / 2).nonzero()[:, 0]
+    points = scene.splats.means[heavy[:: 1 + len(heavy) // PAIRED]].double().cpu().numpy()
+    apart = (points[:, None] - points).reshape(-1, 3)
+    way = apart[np.linalg.norm(apart, axis=1) < NEIGHBORS * scene.gap] @ plane.T @ (1, 1j)
+    turn = np.angle((way**4 / np.maximum(abs(way), 1e-9) ** 3).sum()) / 4  # the same for a quarter turn
+    along = (np.cos(turn), np.sin(turn)) @ plane
+    return np.stack([along, np.cross(up, along), up])
 
 
 def _sharpened(scene: Answering, relevancy: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
@@ -130,9 +146,8 @@ def _sharpened(scene: Answering, relevancy: Float[Tensor, " n"]) -> Float[Tensor
     weight = np.sqrt(mass[rows]) * len(rows) / 2
     weight[: len(match)] /= np.sqrt(mass[match]).sum()
     weight[len(match) :] /= np.sqrt(mass[around]).sum()
-    model = LogisticRegression(C=10).fit(
-        colors[rows], np.arange(len(rows)) < len(match), sample_weight=weight
-    )
+    matches = np.arange(len(rows)) < len(match)
+    model = LogisticRegression(C=10).fit(colors[rows], matches, sample_weight=weight)
     return relevancy * torch.from_numpy(model.predict_proba(colors)[:, 1]).to(relevancy)
 
 

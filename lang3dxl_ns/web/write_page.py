@@ -73,8 +73,8 @@ _SUGGESTED = (
 _RANKING = ("PEAK", "LARGE", "RIM", "STRONG", "CORE", "JOINED", "OUTLIERS", "DENSE")
 _THINGS = (
     (pieces, "LEVELS PART DEPTH FILLED"),
-    (join, "SHARED SPLINTER VIEWS CRUMB OFTEN MOST_SHARED SLIM STRAIGHT"),
-    (thing, "OUTLIERS TURNS"),
+    (join, "SHARED SPLINTER VIEWS CRUMB OFTEN SLIM STRAIGHT"),
+    (thing, "OUTLIERS"),
     (find, "COLORED SAME"),
     (grammar, "BESIDE INSIDE CLOSE"),
 )
@@ -152,6 +152,7 @@ class Page:
             "antialiased": scene.splats.antialiased,
             "background": [0, 0, 0] if scene.background is None else scene.background.tolist(),
             "up": find.up_of(scene).tolist(),
+            "edges": find.axes_of(scene).tolist(),
             "tour": told.tour,
             "meters": None if scene.file.georeference is None else asdict(scene.file.georeference),
             "start": camera_json(scene.overview.full_camera),
@@ -371,19 +372,16 @@ def write_page(page: Page, folder: Path) -> int:
     """Write a page's files into a folder for any static web server; return the number of bytes. Raises
     UserError for a folder that has files of these names, or pictures, and is not such a page."""
     make_folder(folder)
-    index, names = (
-        folder / _INDEX.name,
-        {*(path.name for path in _FILES), "scene.json", "vocabulary.json", *_MADE},
-    )
+    index, own = folder / _INDEX.name, [*(path.name for path in _FILES), *_MADE]
     ours = index.is_file() and "<title>A scene to ask</title>" in index.read_text(errors="replace")
     other = (".bin", *PHOTO_SUFFIXES)  # whoever serves a folder of photos would publish them
     here = sorted(folder.iterdir())
+    names = {*own, "scene.json", "vocabulary.json"}
     taken = [path.name for path in here if path.name in names or path.suffix.lower() in other]
     if taken and not ours:
         raise UserError(f"{folder} holds {taken[0]}, which is not a scene's page: name a folder of its own")
     files = page.files()
-    own = [*(path.name for path in _FILES), *_MADE]  # modules import each other by these names
-    data = sorted(files.keys() - {*own})
+    data = sorted(files.keys() - {*own})  # modules import each other by their own names
     data.remove("scene.json")
     # Data have names by content, which scene.json lists: a page whose writing is stopped, or whose files a
     # browser or a copy keeps from earlier, never shows the splats of one scene with the words of another.
