@@ -22,12 +22,13 @@ from lang3dxl_ns.common.files import make_folder, replace_file
 from lang3dxl_ns.common.pictures import PHOTO_SUFFIXES
 from lang3dxl_ns.files.scene_file import Provenance
 from lang3dxl_ns.query import view_ranking
+from lang3dxl_ns.query.ask import prompts_of
 from lang3dxl_ns.query.doubt import BEST, DOUBTFUL, DOUBTFUL_TAUGHT, LEAST_PEAK
 from lang3dxl_ns.query.heat_maps import PROMPT_COLORS
 from lang3dxl_ns.query.language import TABLE, phrases_of
 from lang3dxl_ns.query.negatives import CLEAR, NOTHING, competitors
-from lang3dxl_ns.query.scene import NO_SEMANTICS, Scene
-from lang3dxl_ns.query.text import Prompt, tidy
+from lang3dxl_ns.query.scene import Scene
+from lang3dxl_ns.query.text import NO_SEMANTICS, Prompt, tidy
 from lang3dxl_ns.query.thresholds import EVEN, SHARE
 from lang3dxl_ns.query.trust import ALIKE, ANCHORS, CLEARLY, FAINT, FAR, STRICTER, STRICTEST
 from lang3dxl_ns.query.visibility import spread
@@ -123,8 +124,8 @@ class Page:
             self.levels = levels_of(self.scene, min(self.large, MOST_ROWS))
             self.scene = self.levels.scenes[0]
         scene, within = self.scene, self.scene.config.foreground
-        self.prompts = scene.prompts(list(self.texts)) if self.texts else []
-        self._foreground = scene.prompts(within) if within else []
+        self.prompts = prompts_of(scene, list(self.texts)) if self.texts else []
+        self._foreground = prompts_of(scene, within) if within else []
         self._looks = list(scene.looks.names) if scene.looks else []
         self._toward = scene.overview.camera.position.to(scene.device)
         self._meaning: PackedMeaning | None = None
@@ -288,7 +289,7 @@ class Page:
 
     def _meant(self, meaning: PackedMeaning, word: str) -> tuple[Float[Tensor, "s r"], list[int]]:
         """Return the vectors searched for along with a word, and the negatives that it competes with."""
-        queries = self.scene.queries(self.scene.prompts([Prompt(word)]))
+        queries = self.scene.queries(prompts_of(self.scene, [Prompt(word)]))
         return meaning.of_texts(queries.vectors[list(queries.positive[0])]).cpu(), list(queries.negative[0])
 
     def _encoded(self, meaning: PackedMeaning, texts: list[str]) -> Iterator[Float[Tensor, "m r"]]:
