@@ -16,7 +16,8 @@ from lang3dxl_ns.common.files import expanded
 from lang3dxl_ns.files.runs import OUTPUTS, find_config
 from lang3dxl_ns.files.scene_file import SUFFIX, Provenance, describe_scene_file, read_scene
 from lang3dxl_ns.query.question import QueryConfig
-from lang3dxl_ns.query.scene import Scene, text_encoder
+from lang3dxl_ns.query.scene import Scene
+from lang3dxl_ns.query.text import text_encoder
 
 
 def load_scene(

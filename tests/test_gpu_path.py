@@ -19,6 +19,7 @@ from lab.baselines import BASELINES, langsplat
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.components.compression import CompressedField
 from lang3dxl_ns.open_scene import load_scene
+from lang3dxl_ns.query.ask import prompts_of
 from lang3dxl_ns.scene.capture import open_capture
 from lang3dxl_ns.training import estimate, fit, gaussians
 from lang3dxl_ns.training.step import decoded_side, losses
@@ -314,7 +315,7 @@ def test_words_on_the_gpu_are_those_on_the_cpu(default, gpu):
     with gpu():
         found = gathered("cuda")
         scene = load_scene(default.base_dir / "config.yml")
-        queries = scene.queries(scene.prompts("tower; window"))
+        queries = scene.queries(prompts_of(scene, "tower; window"))
         relevancy, temperature = scene.engine.of_gaussians(queries).cpu(), scene.engine.temperature
         codes = default.pipeline.model.gauss_params["codes"].detach().cpu()
         field = default.pipeline.model.semantic_field
@@ -362,7 +363,8 @@ def test_a_conversation_in_the_viewer(default, gpu):
 
     from scenes import view_of
 
-    from lang3dxl_ns.plugin.conversation import Conversation
+    from lang3dxl_ns.training.conversation import Conversation
+    from lang3dxl_ns.training.snapshot import snapshot
 
     pipeline = default.pipeline
     model = pipeline.model.eval()
@@ -376,7 +378,7 @@ def test_a_conversation_in_the_viewer(default, gpu):
         camera = pipeline.scene_file.photos[0].camera
         outputs = model.get_outputs_for_camera(view_of(camera))
         assert all(value.device == CUDA for value in outputs.values())
-        assert model.scene(pipeline.scene_file).baked().means.device == CUDA
+        assert snapshot(model.run, pipeline.scene_file).baked().means.device == CUDA
         model.answers = None
 
 

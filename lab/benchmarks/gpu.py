@@ -16,7 +16,6 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from lab.benchmarks.interleaved import interleaved_times
 from lab.reports import command_line
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import write_atomically
@@ -196,7 +195,7 @@ def words(count: int, size: tuple[int, int], steps: int) -> dict[str, float]:
     views = [(lambda carried: rasterize(gaussians, camera, carried).image, pixels)]
     torch.cuda.reset_peak_memory_stats()
     photo = lambda: gather(count, views, axes.shape[1], raw["means"])  # noqa: E731
-    seconds = {"gather": median(interleaved_times({"gather": photo}, repeats=3)["gather"])}
+    seconds = {"gather": median_seconds(photo, repeats=3)}
     features, mass = photo()
     # Random pixels have no kinds of things, so that features of 100 kinds are compressed instead.
     kinds = torch.randn(100, features.shape[1], generator=draw).to(features)
@@ -212,7 +211,7 @@ def words(count: int, size: tuple[int, int], steps: int) -> dict[str, float]:
     rows = PerGaussian.of(field, codes)
     text = torch.nn.functional.normalize(torch.randn(CLIP, 1, generator=draw), dim=0).cuda()
     ask = lambda: rows.rows.float() @ (text if rows.head is None else rows.head @ text)  # noqa: E731
-    seconds["ask"] = median(interleaved_times({"ask": ask}, repeats=20)["ask"])
+    seconds["ask"] = median_seconds(ask)
     return {
         "gather a photo (ms)": 1e3 * seconds["gather"],
         "compress (s)": seconds["compress"],
@@ -241,7 +240,7 @@ def encoder(quick: bool) -> dict[str, float]:
             with torch.no_grad(), torch.autocast("cuda", torch.float16):
                 model(pixel_values=crops)
 
-        found[name] = batch / median(interleaved_times({"encode": encode}, repeats=3)["encode"])
+        found[name] = batch / median_seconds(encode, repeats=3)
     return found
 
 
@@ -255,7 +254,7 @@ def reading(size: tuple[int, int]) -> dict[str, float]:
         def read() -> None:
             torch.from_numpy(np.array(Image.open(path).convert("RGB"))).to("cuda")
 
-        return {"photos": 1 / median(interleaved_times({"read": read}, repeats=3)["read"])}
+        return {"photos": 1 / median_seconds(read, repeats=3)}
 
 
 def times_of_parts(parts: dict[str, Callable[[], object]], repeats: int = 20) -> dict[str, float]:
@@ -272,6 +271,11 @@ def times_of_parts(parts: dict[str, Callable[[], object]], repeats: int = 20) ->
     return {name: median(found) for name, found in times.items()}
 
 
+def median_seconds(work: Callable[[], object], repeats: int = 20) -> float:
+    """Median seconds of one piece of work; see `times_of_parts`."""
+    return times_of_parts({"work": work}, repeats)["work"]
+
+
 @torch.no_grad()
 def still(count: int, size: tuple[int, int], prompts: int) -> dict[str, float]:
     """Milliseconds of a frame with heat maps of some prompts, and the peak of its memory, GB."""
@@ -280,7 +284,7 @@ def still(count: int, size: tuple[int, int], prompts: int) -> dict[str, float]:
     gaussians, colors = _gaussians(raw), raw["colors"].sigmoid()
     carried = torch.cat([colors, colors[:, :1].expand(-1, prompts)], dim=1)
     frame = lambda: rasterize(gaussians, camera, carried, render_depth=True)  # noqa: E731
-    seconds = median(interleaved_times({"frame": frame}, repeats=20)["frame"])
+    seconds = median_seconds(frame)
     return {"frame": 1e3 * seconds, "memory (GB)": torch.cuda.max_memory_allocated() / 1e9}
 
 

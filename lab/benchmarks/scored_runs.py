@@ -25,7 +25,7 @@ from torch import Tensor
 
 from lab.benchmarks.ablation_rows import CLIPSEG, FINE_TEACHER, LANGSAM, SAM3, SEGMENTERS, Row
 from lab.landmark.novel_views import read_novel_views
-from lab.reports import in_own_process, reset_host_peak, with_flags
+from lab.reports import in_own_process, reset_host_peak, timing, with_flags
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import expanded, write_atomically
 from lang3dxl_ns.common.reports import host_peak
@@ -234,7 +234,7 @@ def write_output_to(log: Path) -> None:
 
 
 def _train_and_score(run: Run, settings: RunSettings, work: Path) -> dict[str, float]:
-    from lang3dxl_ns.common.reports import measure
+    from lab.baselines.langsplat import LangSplat
     from lang3dxl_ns.evaluation.aggregate import average
     from lang3dxl_ns.plugin.trainer import Lang3DXLTrainer
 
@@ -242,10 +242,10 @@ def _train_and_score(run: Run, settings: RunSettings, work: Path) -> dict[str, f
     torch.manual_seed(run.seed)
     trainer: Lang3DXLTrainer = config.setup(local_rank=0, world_size=1)
     start, clock = _now(), time.perf_counter()
-    with measure() as parts:
+    with timing({"learn": [(LangSplat, "learn_targets")]}) as parts:
         trainer.setup()
     set_up = _now() - start
-    learned = set_up * sum(parts.get("learn targets", ())) / (time.perf_counter() - clock)
+    learned = set_up * sum(parts["learn"]) / (time.perf_counter() - clock)
     _reset_peak()
     start = _now()
     trainer.train()
@@ -299,18 +299,20 @@ def _peak() -> float:
 def _time_answers(pipeline: Lang3DXLPipeline) -> dict[str, float]:
     """Measure the median milliseconds to render a held-out view, and to answer all prompts in it."""
     from lang3dxl_ns.plugin.cameras import photo_camera
+    from lang3dxl_ns.query.answer import relevancy_maps
+    from lang3dxl_ns.training.snapshot import snapshot
 
     scorer = pipeline.evaluation.scorer
     if scorer is None:
         return {}
     pipeline.eval()
     times: dict[str, list[float]] = {"render_ms": [], "answer_ms": []}
-    scene = pipeline.model.scene(pipeline.scene_file, encode_texts=scorer.encode_texts)
+    scene = snapshot(pipeline.model.run, pipeline.scene_file, encode_texts=scorer.encode_texts)
     for camera, _ in islice(pipeline.datamanager.fixed_indices_eval_dataloader, _TIMED_PHOTOS):
         start = _now()
         pipeline.model.get_outputs_for_camera(camera)
         rendered = _now()
-        scene.relevancy_maps(photo_camera(camera).camera(), scorer.queries.to(pipeline.device))
+        relevancy_maps(scene, photo_camera(camera).camera(), scorer.queries.to(pipeline.device))
         times["render_ms"].append(1000 * (rendered - start))
         times["answer_ms"].append(1000 * (_now() - rendered))
     return {name: median(values) for name, values in times.items()}

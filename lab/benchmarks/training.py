@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import Counter
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from multiprocessing import get_context
@@ -10,7 +11,7 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from lab.reports import command_line
+from lab.reports import command_line, timing
 from lang3dxl_ns.common.reports import describe_machine, markdown_table, write_report
 from lang3dxl_ns.common.settings_help import showing
 
@@ -58,7 +59,6 @@ def _train_and_evaluate(settings: TrainingBenchmark, threads: int = 0) -> dict[s
     import torch
 
     from lab.run_config import run_config
-    from lang3dxl_ns.common.reports import measure
     from lang3dxl_ns.plugin.trainer import Lang3DXLTrainer
 
     name = "joint" if settings.clip != "none" else "rgb"
@@ -72,15 +72,22 @@ def _train_and_evaluate(settings: TrainingBenchmark, threads: int = 0) -> dict[s
     torch.manual_seed(config.machine.seed)
     trainer: Lang3DXLTrainer = config.setup(local_rank=0, world_size=1)
     trainer.setup()
-    _time_parts(trainer)
+    iterate, spent = trainer.train_iteration, Counter[str]()
+
+    def iterate_by_parts(step: int) -> Any:
+        with timing(_parts(trainer)) as found:
+            result = iterate(step)
+        spent.update({name: sum(seconds) for name, seconds in found.items()})
+        return result
+
+    trainer.train_iteration = iterate_by_parts  # type: ignore[method-assign]
     start = time.perf_counter()
-    with measure() as seconds:
+    with timing({"step": [(trainer, "train_iteration")]}) as seconds:
         trainer.train()
     total = time.perf_counter() - start
     metrics = trainer.pipeline.get_average_eval_image_metrics()
     step = median(seconds["step"])
-    # "losses" is entered twice in a step with semantics.
-    split = {name: sum(seconds[name]) / len(seconds["step"]) for name in PARTS if name in seconds}
+    split = {name: spent[name] / len(seconds["step"]) for name in PARTS if name in spent}
     cuda = torch.cuda.is_available()
     return {
         "metrics": metrics,
@@ -95,32 +102,28 @@ def _train_and_evaluate(settings: TrainingBenchmark, threads: int = 0) -> dict[s
     }
 
 
-def _time_parts(trainer: Any) -> None:
-    """Wrap the trainer's own methods to time them."""
-    from lang3dxl_ns.common.reports import part
+def _parts(trainer: Any) -> dict[str, list[tuple[Any, str]]]:
+    """Return the functions of each part of a step."""
+    from torch import Tensor
 
-    def timed(name, function):
-        def run(*args, **kwargs):
-            with part(name):
-                return function(*args, **kwargs)
+    from lang3dxl_ns.components import losses
+    from lang3dxl_ns.components.appearance import AppearanceField
+    from lang3dxl_ns.components.downsampler import AttenuatedDownsampler
+    from lang3dxl_ns.components.semantic_field import SemanticField
+    from lang3dxl_ns.plugin import model
+    from lang3dxl_ns.training.batches import TrainingData
 
-        return run
-
-    trainer.train_iteration = timed("step", trainer.train_iteration)
-    trainer.optimizers.optimizer_scaler_step_some = timed(
-        "optimizer", trainer.optimizers.optimizer_scaler_step_some
-    )
-    scaled = trainer.grad_scaler.scale
-
-    class _TimedLoss:
-        def __init__(self, loss):
-            self.loss = loss
-
-        def backward(self) -> None:
-            with part("backward"):
-                self.loss.backward()
-
-    trainer.grad_scaler.scale = lambda loss: _TimedLoss(scaled(loss))
+    compared = ("rgb_loss", "clip_loss", "dense_loss", "region_variance_loss")
+    return {
+        "data": [(TrainingData, "next")],
+        "render": [(model, "render")],
+        "appearance": [(AppearanceField, "forward")],
+        "decode": [(SemanticField, "forward")],
+        "downsample": [(AttenuatedDownsampler, "match")],
+        "losses": [(losses, name) for name in compared],
+        "backward": [(Tensor, "backward")],
+        "optimizer": [(trainer.optimizers, "optimizer_scaler_step_some")],
+    }
 
 
 def markdown(settings: TrainingBenchmark, results: dict[str, dict]) -> str:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable, Iterator
 from functools import partial
 from itertools import product
+from unittest.mock import patch
 
 import torch
 from jaxtyping import Float
@@ -13,7 +15,7 @@ from torch import Tensor
 from torch.func import functional_call
 
 from lab.numerics.measure import EXACT, Bounds, Case, Maps, Problem
-from lang3dxl_ns.common.kernels import numba_works
+from lang3dxl_ns.common.kernels import VARIABLE, numba_works
 from lang3dxl_ns.components.hash_grid import COORDINATE_LIMIT, HASH_PRIMES, HashGrid
 
 LARGE = 512.0
@@ -96,7 +98,6 @@ def _problem(
     x = points()
     # The levels grow by exactly 2, from 16 + 2 to 2048 + 2 vertices, so that cells are powers of two.
     grid = HashGrid(x.shape[1], 8, 4, log2_table, 18, 2050, generator=torch.Generator().manual_seed(0))
-    grid.kernels = kernels
     cells = 2.0 ** torch.arange(4, 12)
     grid.cells.copy_(cells)
     grid.dense_resolutions.copy_((cells[: grid.dense_levels] + 2).long())
@@ -107,7 +108,8 @@ def _problem(
     def compute(leaves: Maps) -> Maps:
         used = leaves["table"] if table_type is None else leaves["table"].to(table_type)
         coordinates = leaves["x"] if coordinate_type is None else leaves["x"].to(coordinate_type)
-        return {"features": functional_call(grid.to(used.device), {"table": used}, (coordinates,))}
+        with patch.dict(os.environ, {VARIABLE: kernels}):
+            return {"features": functional_call(grid.to(used.device), {"table": used}, (coordinates,))}
 
     def reference(leaves: Maps) -> Maps:
         return {"features": interpolate_reference(grid, leaves["table"], leaves["x"])}

@@ -1,13 +1,10 @@
 """The GPU benchmark with small sizes, on a fake GPU (tests/fake_gpu.py) and on a real one if there is one."""
 
-from functools import partial
-
 import pytest
 import torch
 from fake_gpu import fake_gpu, real_gpu
 
 from lab.benchmarks import gpu as benchmark
-from lab.benchmarks.interleaved import interleaved_times
 
 REAL = [pytest.param(real_gpu, marks=pytest.mark.cuda, id="real")] if torch.cuda.is_available() else []
 
@@ -16,9 +13,8 @@ REAL = [pytest.param(real_gpu, marks=pytest.mark.cuda, id="real")] if torch.cuda
 def test_it_writes_a_file_and_keeps_finished_parts(tmp_path, monkeypatch, gpu):
     # Of these few steps three numbers are never enough, and six take ten times as long.
     monkeypatch.setattr("lang3dxl_ns.components.compression.CODE_DIMS", (3,))
-    once = partial(benchmark.times_of_parts, repeats=1), lambda work, repeats: interleaved_times(work, 1)
-    for name, measured in zip(("times_of_parts", "interleaved_times"), once, strict=True):
-        monkeypatch.setattr(benchmark, name, measured)
+    measure = benchmark.times_of_parts
+    monkeypatch.setattr(benchmark, "times_of_parts", lambda parts, repeats=1: measure(parts, 1))
     with gpu():
         benchmark.GpuBenchmark(tmp_path, quick=True).main()
         report = (tmp_path / "gpu.md").read_text()

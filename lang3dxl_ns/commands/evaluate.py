@@ -149,10 +149,8 @@ class EvaluateThings:
 
 @dataclass(kw_only=True)
 class EvaluatePool:
-    """Combine scenes: average over all photos, and over the scenes' means.
-
-    Writes scores.md and scores.json.
-    """
+    """Combine scenes: average over all photos, and over the scenes' means. Writes scores.md and
+    scores.json."""
 
     reports: list[Path]
     """The scores.json of each scene from `lang3dxl evaluate`, or its file from `ns-eval --output-path`."""

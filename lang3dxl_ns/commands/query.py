@@ -24,6 +24,7 @@ from lang3dxl_ns.common.settings_help import showing
 from lang3dxl_ns.files.scene_file import Provenance, check_scene_name, replace_scene
 from lang3dxl_ns.files.splat_file import check_splat_name
 from lang3dxl_ns.open_scene import load_scene, provenance_of
+from lang3dxl_ns.query.answer import best_views
 from lang3dxl_ns.query.match import save_picture, together
 from lang3dxl_ns.query.question import QueryConfig, Question
 from lang3dxl_ns.query.scene import Scene
@@ -147,7 +148,7 @@ class Query:
         elif self.image is not None:
             asked = {scene.file.photo(self.image).name: everything}
         else:
-            best = scene.best_views(question)
+            best = best_views(scene, question)
             asked = {photo: [i for i in everything if best[i] == photo] for photo in best}
         return list(zip(file_names(list(asked)), asked, asked.values(), strict=True))
 

@@ -5,16 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import tyro
 
 from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.settings_help import showing
-
-if TYPE_CHECKING:
-    from lang3dxl_ns.things.thing import Thing
 
 
 @showing("scene", "text", "ask", "out", "splats", "view")
@@ -66,7 +62,7 @@ class ListThings:
             chosen = answer(request, named, sight)
             whole = request.count and not (request.relation or request.without)
             told = by_word[request.word].count if whole else str(len(chosen))
-            listed = ", ".join(_described(thing) for thing in chosen)
+            listed = ", ".join(f"{t.word} {t.id}, best seen in {t.sightings[0].photo}" for t in chosen)
             doubt = None if whole else unsure(request, named, sight)  # the range of a count tells it
             note = f" (unsure, since {doubt})" if doubt else ""
             say(f"{text}: {told if request.count else listed or 'none found'}{note}")
@@ -76,8 +72,3 @@ class ListThings:
             if self.splats:
                 write_things(scene, answers, self.out / "splats")
             say(f"Wrote the things to {self.out}")
-
-
-def _described(thing: Thing) -> str:
-    seen = f", best seen in {thing.sightings[0].photo}" if thing.sightings else ""
-    return f"{thing.word} {thing.id}{seen}"

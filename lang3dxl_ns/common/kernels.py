@@ -17,10 +17,10 @@ MOST_SUMS = 512 * 2**20
 """Most bytes of the sums that threads keep apart in a backward pass; large scenes use fewer threads."""
 
 
-def takes_kernels(tensor: Tensor, wanted: str | None = None) -> bool:
+def takes_kernels(tensor: Tensor) -> bool:
     """Return whether the compiled kernels are available, enabled, and suit a tensor's device and number type.
-    `wanted` is "numba" or "torch"; None reads the environment variable. Raises UserError for other names."""
-    wanted = wanted or os.environ.get(VARIABLE, "numba")
+    Raises UserError if the environment variable has another value than "numba" and "torch"."""
+    wanted = os.environ.get(VARIABLE, "numba")
     if wanted not in ("numba", "torch"):
         raise UserError(f"{VARIABLE} is {wanted!r}: set it to numba or torch, or unset it")
     fits = tensor.device.type == "cpu" and tensor.dtype in (torch.float32, torch.float64)

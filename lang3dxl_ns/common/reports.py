@@ -1,4 +1,4 @@
-"""Measurements and reports: time by parts, peak memory, machine description, atomic JSON and markdown."""
+"""Measurements and reports: time, peak memory, machine description, atomic JSON and markdown."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import os
 import platform
 import sys
 import time
-from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import date
@@ -61,31 +60,12 @@ def host_peak() -> int:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss  # bytes on macOS
 
 
-_seconds: dict[str, list[float]] | None = None
-
-
 @contextmanager
-def part(name: str) -> Iterator[None]:
-    """Time the enclosed block as `name`. Does nothing outside `measure()`."""
-    if _seconds is None:
-        yield
-        return
-    synchronize()
+def timed(seconds: dict[str, float], name: str) -> Iterator[None]:
+    """Keep how long the enclosed block takes in `seconds`, under its name."""
     start = time.perf_counter()
     yield
-    synchronize()
-    _seconds[name].append(time.perf_counter() - start)
-
-
-@contextmanager
-def measure() -> Iterator[dict[str, list[float]]]:
-    """Collect the seconds of every enclosed `part`. Yields {name: one entry per visit}."""
-    global _seconds
-    _seconds = defaultdict(list)
-    try:
-        yield _seconds
-    finally:
-        _seconds = None
+    seconds[name] = time.perf_counter() - start
 
 
 def markdown_table(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:

@@ -45,9 +45,6 @@ class HashGrid(nn.Module):
         generator: source of the uniform ± 1e-4 initial values.
     """
 
-    kernels: str | None = None
-    """Kernels to use on a CPU, "numba" or "torch"; None for the environment's choice."""
-
     def __init__(
         self,
         input_dim: int,
@@ -100,7 +97,7 @@ class HashGrid(nn.Module):
             -COORDINATE_LIMIT, COORDINATE_LIMIT
         )
         narrow = self.features_per_level <= _WIDEST_ROW_OF_KERNELS
-        if narrow and takes_kernels(x, self.kernels) and x.dtype == self.table.dtype:
+        if narrow and takes_kernels(x) and x.dtype == self.table.dtype:
             return self._interpolated_by_kernels(x)
         # Whole units are separate integers: far from 0, a float32 product has no digits left for a fraction.
         whole = x.detach().floor()

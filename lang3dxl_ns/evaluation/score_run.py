@@ -34,6 +34,7 @@ from lang3dxl_ns.evaluation.photo_metrics import (
 from lang3dxl_ns.evaluation.score_scene import truths_of
 from lang3dxl_ns.evaluation.scores import LanguageScorer, bounds, inside, map_size, open_scorer
 from lang3dxl_ns.preparation.targets import Batch, foreground
+from lang3dxl_ns.query.answer import relevancy_maps
 from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.rendering import composite
 from lang3dxl_ns.scene.camera import Camera
@@ -220,13 +221,13 @@ class _Photos:
         scene, photo, keep = self.scene, self.data.photos[batch["name"]], foreground(batch)
         size = scorer.truth.scoring_size(photo.height, photo.width)
         start = perf_counter()
-        raw = scorer.named(scene.relevancy_maps(camera, scorer.queries.to(scene.device)), size)
+        raw = scorer.named(relevancy_maps(scene, camera, scorer.queries.to(scene.device)), size)
         synchronize()
         evaluated.metrics["query_seconds"] = perf_counter() - start
         published = None
         if not scorer.smooths:
             queries = scorer.published_queries.to(scene.device)
-            published = scorer.named(scene.relevancy_maps(camera, queries), size)
+            published = scorer.named(relevancy_maps(scene, camera, queries), size)
         variants = scorer.variants(raw, keep, scene.engine.temperature, published)
         teacher = scorer.variants(scorer.teacher_maps(batch["clip_target"], size), keep)[""]
         evaluated.maps = inside(raw, keep)

@@ -17,6 +17,7 @@ from lang3dxl_ns.evaluation.ground_truth import GroundTruth
 from lang3dxl_ns.evaluation.label_limit import Masks, lifted_labels
 from lang3dxl_ns.evaluation.layouts import Truth
 from lang3dxl_ns.evaluation.scores import LanguageScorer, map_size, overlap
+from lang3dxl_ns.query.answer import locate, relevancy_maps
 from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.query.text import Prompt
 from lang3dxl_ns.query.view_ranking import Box, groups, shared_volume
@@ -47,7 +48,7 @@ def score_scene(
         size, keep = truth.scoring_size(height, width), photo.foreground()
         keep = None if keep is None else keep.to(scene.device)
         raw, published = (
-            scorer.named(scene.relevancy_maps(photo.camera, queries.to(scene.device)), size)
+            scorer.named(relevancy_maps(scene, photo.camera, queries.to(scene.device)), size)
             for queries in (queries_shown, scorer.published_queries)
         )
         variants = scorer.variants(raw, keep, scene.engine.temperature, published)
@@ -108,7 +109,7 @@ def score_selections(scene: Scene, truth: GroundTruth, photos: Sequence[ScenePho
                 ious[category].append(overlap(match.mask, truths[category].mask)["iou"])
     shares = lifted_labels(scene.splats, labels, truth.categories)
     figures: dict[str, float] = {}
-    for category, found, share in zip(truth.categories, scene.places(question), shares.T, strict=True):
+    for category, found, share in zip(truth.categories, locate(scene, question), shares.T, strict=True):
         mass = scene.mass
         marked = (share > 0.5) & (mass > 0)
         if not ious[category] or not marked.any():

@@ -28,9 +28,7 @@ def score_things(scene: Scene, path: Path) -> list[tuple[str, int, int, int, flo
         raise UserError(f"{path} names no photo of this scene: file_name must be {scene.photos[0].name}, …")
     given, scores = _boxes(coco(scene, scene.things(words))), []
     for word in words:
-        sides = [
-            [np.array(boxes.get((n, word), [])).reshape(-1, 4) for boxes in (true, given)] for n in names
-        ]
+        sides = [[np.array(of.get((n, word), [])).reshape(-1, 4) for of in (true, given)] for n in names]
         there, listed = (sum(len(side[i]) for side in sides) for i in (0, 1))
         found = sum(_matches(*side) for side in sides)
         scores.append((word, there, found, listed - found, round(2 * found / max(there + listed, 1), 3)))
@@ -39,9 +37,7 @@ def score_things(scene: Scene, path: Path) -> list[tuple[str, int, int, int, flo
 
 def _boxes(content: dict[str, Any]) -> dict[tuple[str, str], list[list[float]]]:
     """List corners, as shares of the photo's sides, by photo and word."""
-    images = {
-        image["id"]: (image["file_name"], image["width"], image["height"]) for image in content["images"]
-    }
+    images = {one["id"]: (one["file_name"], one["width"], one["height"]) for one in content["images"]}
     words = {c["id"]: str(c["name"]) for c in content["categories"]}
     found: dict[tuple[str, str], list[list[float]]] = {}
     for label in content["annotations"]:

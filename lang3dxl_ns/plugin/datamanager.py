@@ -20,7 +20,6 @@ from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from lang3dxl_ns.common.checks import check_numbers
 from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.common.reports import part
 from lang3dxl_ns.common.settings_help import showing, without
 from lang3dxl_ns.plugin.cameras import to_cameras
 from lang3dxl_ns.plugin.dataparser import (
@@ -170,9 +169,8 @@ class Lang3DXLDataManager(FullImageDatamanager):
     def next_train(self, step: int) -> tuple[Cameras, Batch]:  # type: ignore[override]
         """Return camera and batch of the next training photo; every photo appears once per round. A photo
         found to be damaged is left out from then on, and logged."""
-        with part("data"):
-            view, batch = self.data.next()
-            return to_cameras(view), batch
+        view, batch = self.data.next()
+        return to_cameras(view), batch
 
     def next_eval_image(self, step: int) -> tuple[Cameras, Batch]:  # type: ignore[override]
         """Return camera and batch of a held-out photo, in turn."""

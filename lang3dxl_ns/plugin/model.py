@@ -19,23 +19,19 @@ from torch.optim import Optimizer
 
 from lang3dxl_ns.common.console import say_once
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.common.reports import part
 from lang3dxl_ns.common.settings_help import showing, without
 from lang3dxl_ns.components.appearance import AppearanceField, render_in_look
 from lang3dxl_ns.components.feature_decoder import Decoder
 from lang3dxl_ns.evaluation.photo_metrics import ImageMetrics, psnr
 from lang3dxl_ns.plugin.cameras import photo_camera
-from lang3dxl_ns.plugin.conversation import Conversation
 from lang3dxl_ns.plugin.inert_settings import OF_SPLATFACTO
 from lang3dxl_ns.plugin.splatfacto import SplatfactoModel, SplatfactoModelConfig
 from lang3dxl_ns.preparation.targets import FACTS, Batch, SceneFacts, foreground
 from lang3dxl_ns.query.question import Question, pictures
-from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.rendering import Rendering
-from lang3dxl_ns.scene.record import SceneRecord
+from lang3dxl_ns.training.conversation import Conversation
 from lang3dxl_ns.training.parts import CameraRefinement
 from lang3dxl_ns.training.settings import TrainingSettings
-from lang3dxl_ns.training.snapshot import snapshot
 from lang3dxl_ns.training.state import Training
 from lang3dxl_ns.training.step import finish, losses, render
 
@@ -127,13 +123,6 @@ class Lang3DXLModel(SplatfactoModel):
     def optimizers(self, optimizers: Mapping[str, Optimizer]) -> None:
         self.run.optimizers = optimizers
 
-    # ── the scene so far ────────────────────────────────────────────────────────────────────────────
-
-    def scene(self, file: SceneRecord, **how: Any) -> Scene:
-        """Copy the present state to a separate scene with the photos, cameras and CLIP of a record; see
-        `snapshot`."""
-        return snapshot(self.run, file, **how)
-
     # ── looking ─────────────────────────────────────────────────────────────────────────────────────
 
     @torch.no_grad()
@@ -160,8 +149,7 @@ class Lang3DXLModel(SplatfactoModel):
         decoder learns from renderings; otherwise also `depth` and `bottleneck`, a picture of the codes."""
         if not self.training:
             return self._shown(camera, None, self._code_colors())[1]
-        with part("render"):
-            rendered = render(self.run, photo_camera(camera))
+        rendered = render(self.run, photo_camera(camera))
         outputs = {"rgb": rendered.rgb, "accumulation": rendered.alpha, "background": rendered.background}
         return outputs if rendered.codes is None else outputs | {"codes": rendered.codes}
 

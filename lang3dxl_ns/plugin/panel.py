@@ -17,13 +17,13 @@ from numpy import ndarray as Array
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.worker import Worker
-from lang3dxl_ns.plugin.conversation import Conversation, plain
 from lang3dxl_ns.plugin.model import Lang3DXLModel
 from lang3dxl_ns.plugin.viewer_guard import guard_viewers
 from lang3dxl_ns.query.match import Found
 from lang3dxl_ns.scene.camera import Camera
 from lang3dxl_ns.scene.record import SceneRecord, overview
 from lang3dxl_ns.things.thing import Thing
+from lang3dxl_ns.training.conversation import Conversation, plain
 
 if TYPE_CHECKING:
     from nerfstudio.engine.trainer import Trainer

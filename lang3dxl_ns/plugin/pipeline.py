@@ -26,7 +26,8 @@ from lang3dxl_ns.plugin.load_scene import model_state
 from lang3dxl_ns.plugin.model import Lang3DXLModel, Lang3DXLModelConfig, RenderedAnswers
 from lang3dxl_ns.plugin.panel import AskPanel
 from lang3dxl_ns.scene.record import SCENE_FILE, SceneRecord
-from lang3dxl_ns.training.learn_codes import learn_words
+from lang3dxl_ns.training.learn_codes import begin_codes, learn_words
+from lang3dxl_ns.training.snapshot import snapshot
 
 QUERY_VARIABLE = "LANG3DXL_QUERY"
 
@@ -81,11 +82,7 @@ class Lang3DXLPipeline(VanillaPipeline):
 
     def get_train_loss_dict(self, step: int):
         """Compute outputs, losses and metrics of the next photo; codes that start from photos come first."""
-        run = self.model.run
-        if run.codes_begin:
-            if run.settings.codes_from == "photos":
-                self.learn_words()
-            run.codes_have_begun = True
+        begin_codes(self.model.run, self.datamanager.data)
         outputs, losses, metrics = super().get_train_loss_dict(step)
         self.last_losses = {name: loss.detach() for name, loss in losses.items()}
         return outputs, losses, metrics
@@ -111,12 +108,12 @@ class Lang3DXLPipeline(VanillaPipeline):
             run = self.datamanager.config.run
             cache = None if run is None else run / "lang3dxl_visible.safetensors"
             CONSOLE.log(f"Looking for {escape(self.query)}")
-            scene = self.model.scene(self.scene_file, cache=cache)
+            scene = snapshot(self.model.run, self.scene_file, cache=cache)
             self.model.answers = RenderedAnswers(scene.ask(self.query))
 
     def learn_words(self) -> None:
         """Gather the training photos' features onto the present Gaussians, and learn codes."""
-        learn_words(self.model.run, self.datamanager.data.every_photo(), len(self.datamanager.train_dataset))
+        learn_words(self.model.run, self.datamanager.data)
 
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool | None = None) -> None:  # type: ignore[override]
         """Load a checkpoint; any mismatch is an error (nerfstudio would silently ignore it)."""

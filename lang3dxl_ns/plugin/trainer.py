@@ -43,6 +43,7 @@ from lang3dxl_ns.training.estimate import estimate
 from lang3dxl_ns.training.learn_codes import forget_words
 from lang3dxl_ns.training.learning_rates import add_rows_to_state
 from lang3dxl_ns.training.memory import out_of_memory, plan
+from lang3dxl_ns.training.snapshot import snapshot
 from lang3dxl_ns.training.step_guard import StepGuard
 
 _BEFORE_TRAINING = ("config.yml", SCENE_FILE, f"{NEEDS_FILE}.*", "dataparser_transforms.json", "events.*")
@@ -381,7 +382,7 @@ class Lang3DXLTrainer(Trainer):
         how = f"{self.config.method_name}, {config.decoder.name}, {config.total_steps} iterations"
         file = data.record(model.run)
         file.write(self.base_dir / SCENE_FILE)
-        scene = model.scene(file)
+        scene = snapshot(model.run, file)
         checkpoints = self.config.load_dir or (place and place.parent)
         earlier = sorted(checkpoints.parent.glob(f"[!.]*{SUFFIX}")) if checkpoints else []  # may be renamed
         told = Provenance(title=path.stem, made_how=how)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
+from statistics import median_high
 
 import torch
 from jaxtyping import Float
@@ -18,6 +20,7 @@ from lang3dxl_ns.query.question import Question
 from lang3dxl_ns.query.relevancy import Queries
 from lang3dxl_ns.query.view_ranking import Viewpoint, rank_views, strongest_match
 from lang3dxl_ns.rendering import composite
+from lang3dxl_ns.rendering.gathering import filled_pixels
 from lang3dxl_ns.scene.camera import Camera, resized
 
 
@@ -32,7 +35,8 @@ def matches(scene: Answering, question: Question, place: Place, size: int | None
     channels = question.channels
     asked = time.perf_counter()
     camera = scene.camera(place, size)
-    small = resized(camera, scene.trained_side)
+    sides = [max(photo.camera.width, photo.camera.height) for photo in scene.photos if photo.split == "train"]
+    small = resized(camera, median_high(sides)) if sides else camera
     enlarged = small.width < camera.width
     view = scene.view(place, camera, channels=None if enlarged else channels)
     rendered, rendering = time.perf_counter(), view.rendering
@@ -106,7 +110,7 @@ def words_at(
         raise UserError(f"{x}, {y} lies outside the view of {camera.width} × {camera.height} pixels")
     pixel = torch.zeros(camera.height, camera.width, device=scene.device)
     pixel[int(y), int(x)] = 1.0
-    share = scene.fill(camera, pixel)
+    share = filled_pixels(partial(composite, scene.splats, camera), pixel, len(scene.splats))
     rows = share.nonzero().squeeze(1)
     features = scene.engine.features(rows)
     if not words or float(share[rows] @ (features != 0).any(1).float()) < scene.config.min_alpha:

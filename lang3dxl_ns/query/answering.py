@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Protocol, TypeAlias
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from numpy import ndarray as Array
 from torch import Tensor
 
-from lang3dxl_ns.components.appearance import Look
 from lang3dxl_ns.components.feature_decoder import Decoder
+from lang3dxl_ns.query.doubt import Doubts
 from lang3dxl_ns.query.engine import QueryEngine
 from lang3dxl_ns.query.match import View
-from lang3dxl_ns.query.question import QueryConfig, Question
+from lang3dxl_ns.query.question import QueryConfig
+from lang3dxl_ns.query.relevancy import Queries
 from lang3dxl_ns.query.text import Prompt, TextEncoder
 from lang3dxl_ns.query.visibility import VisibleGaussians
 from lang3dxl_ns.rendering import Rendering, Splats
@@ -45,23 +46,18 @@ class Answering(Protocol):
     @property
     def gap(self) -> float: ...
     @property
-    def trained_side(self) -> int: ...
-    @property
     def engine(self) -> QueryEngine: ...
     @property
     def text(self) -> TextEncoder: ...
+    @property
+    def doubts(self) -> Doubts: ...
+    @property
+    def foreignness(self) -> float | None: ...
+    @property
+    def anchors(self) -> Bool[Tensor, "anchors n"]: ...
     def semantics(self) -> tuple[Decoder, Float[Tensor, "n d"]]: ...
     def camera(self, place: Place, size: int | None = None) -> Camera: ...
-    def draw(
-        self, camera: Camera, channels: Float[Tensor, "n d"] | None = None, look: Look | None = None
-    ) -> Rendering: ...
-    def view(
-        self,
-        place: Place,
-        camera: Camera,
-        look: str | None = None,
-        channels: Float[Tensor, "n d"] | None = None,
-    ) -> View: ...
-    def fill(self, camera: Camera, weight: Float[Tensor, "h w"]) -> Float[Tensor, " n"]: ...
-    def ask(self, texts: str) -> Question: ...
+    def draw(self, camera: Camera, channels: Float[Tensor, "n d"] | None) -> Rendering: ...
+    def view(self, place: Place, camera: Camera, *, channels: Float[Tensor, "n d"] | None) -> View: ...
+    def queries(self, prompts: Sequence[Prompt]) -> Queries: ...
     def synonyms(self, prompt: Prompt) -> list[str]: ...

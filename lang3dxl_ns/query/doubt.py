@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import torch
@@ -51,6 +51,7 @@ class Doubts:
     """Computes every Gaussian's relevancy, 0 where unknown (`QueryEngine.of_gaussians`)."""
     queries: Callable[[Sequence[str]], Queries]
     """Encodes texts as they are, without synonyms (`TextEncoder.plain_queries`)."""
+    _alone: dict[str, float] = field(default_factory=dict, init=False)
 
     def of(self, relevancy: Float[Tensor, "q n"]) -> list[float]:
         """Compute each prompt's doubt from the Gaussians' relevancy: the share of texts, itself among
@@ -61,6 +62,12 @@ class Doubts:
             (1 + int((unrelated >= peak).sum())) / (1 + len(unrelated)) if peak >= LEAST_PEAK else 1.0
             for peak in peaks(relevancy)
         ]
+
+    def alone(self, text: str) -> float:
+        """Return the doubt about a text without its synonyms, which is computed once."""
+        if text not in self._alone:
+            self._alone[text] = self.of(self.relevancy(self.queries([text])))[0]
+        return self._alone[text]
 
     @cached_property
     def unrelated(self) -> Float[Tensor, " u"]:

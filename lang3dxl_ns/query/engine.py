@@ -6,6 +6,7 @@ computes maps from the result.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TypeAlias
@@ -82,7 +83,11 @@ class PerGaussian:
 
     def of_gaussians(self, queries: Queries) -> Float[Tensor, "q n"]:
         """Compute the relevancy of every Gaussian by itself, 0…1; 0 where unknown."""
-        return queries.relevancy_of_cosines(self.cosines(queries), self.temperature) * self.known
+
+        def relevancy(cosines: Tensor) -> Tensor:
+            return queries.relevancy_of_cosines(cosines, self.temperature).T
+
+        return self._of_cosines(relevancy, queries).T * self.known
 
     @torch.no_grad()
     def features(self, which: slice | Int[Tensor, " m"]) -> Float[Tensor, "m c"]:
@@ -93,8 +98,16 @@ class PerGaussian:
     @torch.no_grad()
     def cosines(self, queries: Queries) -> Float[Tensor, "n v"]:
         """Compute the cosine of every Gaussian with every vector; 0 where unknown."""
-        vectors = queries.vectors.T if self.head is None else self.head @ queries.vectors.T
-        return in_chunks(lambda part: part.float() @ vectors, self.rows, self.rows.shape[1], _CHUNK_MB)
+        return self._of_cosines(lambda cosines: cosines, queries)
+
+    def _of_cosines(
+        self, work: Callable[[Float[Tensor, "m v"]], Float[Tensor, "m k"]], queries: Queries
+    ) -> Float[Tensor, "n k"]:
+        """Do work on the cosines of a part of the Gaussians at a time. A vector's cosines lie side by side in
+        memory, since relevancy compares one vector's with another's."""
+        vectors = queries.vectors if self.head is None else queries.vectors @ self.head.T
+        width = max(self.rows.shape[1], len(vectors))
+        return in_chunks(lambda part: work((vectors @ part.float().T).T), self.rows, width, _CHUNK_MB)
 
     def calibrated(self, words: Queries) -> PerGaussian:
         """Return this engine with a temperature that suits the encoder (`relevancy.calibrated`), by words

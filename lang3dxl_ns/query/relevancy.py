@@ -99,8 +99,9 @@ class Queries:
         """Compute sigmoid(τ (max over synonyms − max over competitors)), which is the smallest softmax of the
         best synonym against each competitor (LERF, Kerr et al. 2023): 0…1, above 0.5 where the prompt wins.
         Prompts learned from examples use the margin described at `taught`."""
+        rivals = {rows: _largest(cosines, rows) for rows in set(self.negative)}  # most prompts share theirs
         margins = [
-            _largest(cosines, mine) - _largest(cosines, theirs)
+            _largest(cosines, mine) - rivals[theirs]
             for mine, theirs in zip(self.positive, self.negative, strict=True)
         ]
         first = len(self.vectors) - len(self.learned)

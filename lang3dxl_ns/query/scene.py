@@ -5,10 +5,10 @@ from __future__ import annotations
 import copy
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import KW_ONLY, dataclass, field, replace
-from functools import cached_property, partial
+from dataclasses import KW_ONLY, dataclass, field
+from functools import cached_property
 from pathlib import Path
-from typing import Any, TypeAlias, TypeVar, overload
+from typing import Any, TypeVar, overload
 
 import numpy as np
 import torch
@@ -16,30 +16,29 @@ from jaxtyping import Bool, Float
 from numpy import ndarray as Array
 from torch import Tensor
 
-from lang3dxl_ns.common.console import say_once
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import expanded
 from lang3dxl_ns.components.appearance import AppearanceField, Look, render_in_look
 from lang3dxl_ns.components.feature_decoder import Decoder
 from lang3dxl_ns.files.splat_file import write_matching, write_splats
-from lang3dxl_ns.preparation.encoders import load_image_text_encoder
 from lang3dxl_ns.query import answer
+from lang3dxl_ns.query import ask as asking
 from lang3dxl_ns.query.answering import Place
-from lang3dxl_ns.query.doubt import DOUBTFUL, Doubts, doubtful, peaks
+from lang3dxl_ns.query.ask import Text
+from lang3dxl_ns.query.doubt import DOUBTFUL, Doubts
 from lang3dxl_ns.query.engine import QueryEngine, make_engine
 from lang3dxl_ns.query.floaters import FLOATS, floating
 from lang3dxl_ns.query.match import Found, Match, View
 from lang3dxl_ns.query.question import QueryConfig, Question
 from lang3dxl_ns.query.relevancy import Queries
-from lang3dxl_ns.query.text import EncodeTexts, Prompt, TextEncoder, listed_phrases, parse_prompts, texts_of
+from lang3dxl_ns.query.text import NO_SEMANTICS, EncodeTexts, Prompt, TextEncoder, text_encoder, texts_of
 from lang3dxl_ns.query.thresholds import match_thresholds, matching
-from lang3dxl_ns.query.trust import ANCHORS, alike, foreignness, judged
+from lang3dxl_ns.query.trust import ANCHORS, foreignness
 from lang3dxl_ns.query.visibility import VisibleGaussians, measured, median_distance, total_pixels
-from lang3dxl_ns.query.vocabulary import closest_word, common_words, searched, shipped_vocabulary
-from lang3dxl_ns.rendering import Rendering, Splats, composite
-from lang3dxl_ns.rendering.gathering import filled_pixels
+from lang3dxl_ns.query.vocabulary import searched, shipped_vocabulary
+from lang3dxl_ns.rendering import Rendering, Splats
 from lang3dxl_ns.scene.camera import Camera, posed, resized, with_field_of_view, with_longer_side
-from lang3dxl_ns.scene.record import ScenePhoto, SceneRecord, overview, same_clip
+from lang3dxl_ns.scene.record import ScenePhoto, SceneRecord, overview
 from lang3dxl_ns.things.find import Things, things_of
 from lang3dxl_ns.words.taught_words import Example, TaughtWord, known_word
 from lang3dxl_ns.words.teach import carried_word, learned_word, least_certain_photo
@@ -48,9 +47,6 @@ _ROWS = 65_536
 """Number of Gaussians decoded at a time."""
 LARGEST = 1920
 """Longer side of pictures in pixels if no size is requested."""
-NO_SEMANTICS = "this scene has colors alone (it was trained with clip none): it can't be queried"
-Text: TypeAlias = str | Prompt | Float[Tensor, " c"] | Float[Array, " c"]
-"""A text as `parse_prompts` reads it, or a vector in the space of the scene's CLIP."""
 
 
 @dataclass(eq=False, repr=False)
@@ -87,8 +83,6 @@ class Scene:
     """File that keeps which Gaussians the photos show; if None, every process measures them."""
     watch: Callable[[str], None] | None = None
     """Called with a short description of slow work; if None, a progress bar is shown."""
-    _doubt_alone: dict[str, float] = field(default_factory=dict, init=False)
-    """Doubt about texts without their synonyms, by text."""
 
     def __repr__(self) -> str:
         held_out = sum(photo.split == "eval" for photo in self.photos)
@@ -206,50 +200,7 @@ class Scene:
             UserError: there is no prompt, one is its own negative, the threshold is impossible, or the scene
                 has colors only.
         """
-        requested = self.config.threshold if threshold is None else threshold
-        if requested is not None and not 0 <= requested <= 1:
-            raise UserError(f"the threshold is {requested}: give a relevancy from 0 to 1")
-        rivals = listed_phrases(texts_of(negatives, "a negative"))
-        prompts = [replace(p, negatives=(*p.negatives, *rivals)) for p in self.prompts(texts)]
-        within = self.config.foreground if foreground is None else foreground
-        everything = [*prompts, *(self.prompts(within) if within else ())]
-        if own := [p.text for p in everything if known_word(p.text) in map(known_word, p.negatives)]:
-            raise UserError(f"{own[0]!r} is its own negative, so nothing can match it: name another negative")
-        queries, count = self.queries(everything), len(prompts)
-        relevancy = self.engine.of_gaussians(queries)
-        doubts = [
-            doubt if prompt.taught is None else prompt.taught.doubt
-            for prompt, doubt in zip(everything, self.doubts.of(relevancy), strict=True)
-        ]
-        for prompt, doubt in zip(everything[count:], doubts[count:], strict=True):
-            if advice := doubtful(prompt.text, doubt, prompt.taught is not None):
-                say_once(f"foreground {prompt.text}: {advice}")
-        strict = [bool(prompt.negatives or prompt.taught) for prompt in everything]
-        levels = match_thresholds(relevancy, doubts, strict)
-        fits = peaks(relevancy).tolist()
-        trusts = [
-            judged(
-                prompt.text,
-                doubts[i],
-                fits[i],
-                taught=prompt.taught is not None or prompt.vector is not None,
-                foreign=self.foreignness,
-                meant=closest_word(prompt.text, (*self.words, *common_words())),
-                alike=alike(prompt.text, self.synonyms(prompt), relevancy[i] > levels[i], self.anchors),
-            )
-            for i, prompt in enumerate(prompts)
-        ]
-        return Question(
-            self.engine,
-            tuple(prompts),
-            queries,
-            relevancy,
-            tuple(doubts[:count]),
-            tuple(trusts),
-            levels[:count] if requested is None else (requested,) * count,
-            levels[count:],
-            self.config.min_alpha,
-        )
+        return asking.ask(self, texts, negatives, foreground, threshold)
 
     @overload  # a text is a sequence of texts too, and the first form is meant
     def query(  # type: ignore[overload-overlap]
@@ -303,10 +254,6 @@ class Scene:
         """Find matches of a question's prompts in one view; see `query`."""
         return answer.matches(self, question, place, size)
 
-    def relevancy_maps(self, camera: Camera, queries: Queries) -> Float[Tensor, "q h w"]:
-        """Compute every pixel's relevancy to every query, 0…1, as it is scored, without a foreground."""
-        return answer.relevancy_maps(self, camera, queries)
-
     @overload
     def find(  # type: ignore[overload-overlap]
         self, texts: Text, *, negatives: Sequence[str] = (), threshold: float | None = None, most: int = 10
@@ -338,19 +285,10 @@ class Scene:
         question = self.ask(texts, negatives=negatives, threshold=threshold)
         return _one_or_all(texts, answer.locate(self, question, most))
 
-    def places(self, question: Question, most: int = 10) -> list[Found]:
-        """Find matches of a question's prompts in the scene; see `find`."""
-        return answer.locate(self, question, most)
-
-    def best_views(self, question: Question) -> list[str]:
-        """Return for each prompt the name of the training photo whose view shows it best, or comes closest.
-        Raises UserError if the scene has no training photos."""
-        return answer.best_views(self, question)
-
     def relevancy(self, text: Text) -> Float[Array, " n"]:
         """Compute the relevancy of every Gaussian to one prompt, 0…1; 0 for Gaussians visible in no photo.
         Raises UserError as `ask` does, and for a text that holds several prompts."""
-        return self._one(text).relevancy[0].cpu().float().numpy()
+        return asking.ask_one(self, text).relevancy[0].cpu().float().numpy()
 
     def export(
         self,
@@ -383,7 +321,9 @@ class Scene:
         solid = self.floating <= FLOATS if hide_floaters else None
         if text is None:
             return write_splats(path, splats if solid is None else splats.select(solid), place=place)
-        return write_matching(path, splats, self._one(text, threshold), everything, index, solid, place)
+        return write_matching(
+            path, splats, asking.ask_one(self, text, threshold), everything, index, solid, place
+        )
 
     # ── what the photos show ────────────────────────────────────────────────────────────────────────
 
@@ -399,11 +339,6 @@ class Scene:
             watch=self.watch,
         )
 
-    def fill(self, camera: Camera, weight: Float[Tensor, "h w"]) -> Float[Tensor, " n"]:
-        """Compute how many of a camera's pixels, each of a weight 0…1, every Gaussian fills."""
-        drawn = partial(composite, self.splats, camera)
-        return filled_pixels(drawn, weight, len(self.splats))
-
     @cached_property
     def mass(self) -> Float[Tensor, " n"]:
         """Pixels that every Gaussian fills, summed over all views."""
@@ -413,12 +348,6 @@ class Scene:
     def floating(self) -> Float[Tensor, " n"]:
         """How surely each Gaussian is a floater, 0…1."""
         return floating(self.splats, self.visible, self.draw)
-
-    @cached_property
-    def trained_side(self) -> int:
-        """Median of the training photos' longer sides in pixels."""
-        sides = sorted(max(p.camera.width, p.camera.height) for p in self.photos if p.split == "train")
-        return sides[len(sides) // 2] if sides else LARGEST
 
     @cached_property
     def gap(self) -> float:
@@ -504,20 +433,6 @@ class Scene:
 
     # ── prompts ─────────────────────────────────────────────────────────────────────────────────────
 
-    def prompts(self, texts: Text | Sequence[Text]) -> list[Prompt]:
-        """Parse prompts, and attach the taught words. Raises UserError if there are no prompts."""
-        prompts = list[Prompt]()
-        if isinstance(texts, Array) and texts.dtype.kind in "OU":
-            texts = texts.ravel().tolist()
-        listed: Sequence[Any] = texts if isinstance(texts, list | tuple) else [texts]
-        for text in listed:
-            if isinstance(text, Tensor | Array):
-                text = Prompt("vector", vector=self._vector(text))
-            for prompt in [text] if isinstance(text, Prompt) else parse_prompts(text, self.words):
-                word = None if prompt.vector is not None else self.words.get(known_word(prompt.text))
-                prompts.append(prompt if word is None else replace(prompt, taught=word))
-        return prompts or parse_prompts("")
-
     def queries(self, prompts: Sequence[Prompt]) -> Queries:
         """Encode prompts on the scene's device. Only texts that the scene doubts get their synonyms: where
         CLIP knows the word itself, synonyms would only blur it."""
@@ -530,26 +445,7 @@ class Scene:
         synonyms = [] if fixed else self.text.synonyms(prompt.text)
         if not synonyms or self.config.text.combine != "fallback":
             return synonyms
-        if prompt.text not in self._doubt_alone:
-            alone = self.text.plain_queries([searched(prompt.text)]).to(self.device)
-            self._doubt_alone[prompt.text] = self.doubts.of(self.engine.of_gaussians(alone))[0]
-        return synonyms if self._doubt_alone[prompt.text] > DOUBTFUL else []
-
-    def _vector(self, values: Any) -> Float[Tensor, " c"]:
-        vector = values if isinstance(values, Tensor) else torch.from_numpy(np.asarray(values, np.float32))
-        width = self.semantics()[0].clip_dim
-        if vector.shape != (width,) or not bool(vector.isfinite().all()) or not bool(vector.any()):
-            raise UserError(
-                f"a vector to search for has shape {list(vector.shape)}: this scene's CLIP has {width} "
-                "finite numbers, not all of them 0"
-            )
-        return (vector.double() / vector.double().norm()).float()
-
-    def _one(self, text: Text, threshold: float | None = None) -> Question:
-        question = self.ask(text, threshold=threshold)
-        if len(question.prompts) > 1:
-            raise UserError(f"{text!r} are {len(question.prompts)} prompts: ask for one at a time")
-        return question
+        return synonyms if self.doubts.alone(searched(prompt.text)) > DOUBTFUL else []
 
     # ── computed once ───────────────────────────────────────────────────────────────────────────────
 
@@ -593,18 +489,6 @@ class Scene:
     def doubts(self) -> Doubts:
         """Estimator of which prompts the scene does not contain."""
         return Doubts(self.engine.of_gaussians, lambda texts: self.text.plain_queries(texts).to(self.device))
-
-
-def text_encoder(file: SceneRecord, device: torch.device | str) -> EncodeTexts:
-    """Load the CLIP that a scene's features come from. Raises UserError if it is missing or has changed."""
-    if file.clip is None:
-        raise UserError(NO_SEMANTICS)
-    encoder = load_image_text_encoder(file.clip, device)
-    if not same_clip(encoder.identity, file.clip_identity):
-        raise UserError(
-            f"the CLIP in {file.clip} is not the one that this scene was made with: restore it, or train anew"
-        )
-    return encoder.encode_texts
 
 
 def _pose(place: Any) -> Float[Tensor, "rows 4"]:

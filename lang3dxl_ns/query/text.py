@@ -15,15 +15,18 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.preparation.encoders import load_image_text_encoder
 from lang3dxl_ns.query.doubt import UNRELATED
 from lang3dxl_ns.query.language import meaning, phrases_of
 from lang3dxl_ns.query.negatives import NEGATIVES, competitors
 from lang3dxl_ns.query.relevancy import Queries
 from lang3dxl_ns.query.vocabulary import searched, synonyms_of
+from lang3dxl_ns.scene.record import SceneRecord, same_clip
 from lang3dxl_ns.words.taught_words import TaughtWord, known_word
 
 EncodeTexts = Callable[[list[str]], Float[Tensor, "n c"]]
 """Function that encodes texts, such as `ImageTextEncoder.encode_texts`."""
+NO_SEMANTICS = "this scene has colors alone (it was trained with clip none): it can't be queried"
 
 _SAME = 0.95
 """Cosine from which a vector and a phrase are taken to mean the same."""
@@ -204,3 +207,15 @@ class TextEncoder:
         if not texts:
             return self.vectors(NEGATIVES[:1])[:0]
         return torch.stack([self._vectors[text] for text in texts])
+
+
+def text_encoder(file: SceneRecord, device: torch.device | str) -> EncodeTexts:
+    """Load the CLIP that a scene's features come from. Raises UserError if it is missing or has changed."""
+    if file.clip is None:
+        raise UserError(NO_SEMANTICS)
+    encoder = load_image_text_encoder(file.clip, device)
+    if not same_clip(encoder.identity, file.clip_identity):
+        raise UserError(
+            f"the CLIP in {file.clip} is not the one that this scene was made with: restore it, or train anew"
+        )
+    return encoder.encode_texts

@@ -20,6 +20,7 @@ from PIL import ExifTags
 
 from lang3dxl_ns.common.checks import expect, is_coordinate
 from lang3dxl_ns.common.pictures import NoPictureError, open_picture
+from lang3dxl_ns.scene.colmap import load_pycolmap
 
 LEAST_PHOTOS = 3
 """Number of photos that must agree on a position."""
@@ -28,7 +29,6 @@ GPS_ERROR = 5.0
 LARGEST_UNCERTAINTY = 0.25
 """Relative uncertainty of the scale above which GPS tells nothing."""
 _PAIRS = 2_000
-_SEMI_MAJOR_AXIS, _ECCENTRICITY_2 = 6_378_137.0, 6.694379990141e-3
 _TAGS = ExifTags.GPS
 
 
@@ -136,24 +136,10 @@ def local_meters(positions: Iterable[tuple[float, float, float]]) -> Float64[Arr
     if np.ptp(degrees[:, 1]) > 180:  # on both sides of the date line
         degrees[:, 1] %= 360
         middle = np.median(degrees, axis=0)
-    latitude, longitude = np.radians(middle[:2])
-    sines, cosines = np.sin([latitude, longitude]), np.cos([latitude, longitude])
-    axes = np.array(
-        [
-            [-sines[1], cosines[1], 0.0],
-            [-sines[0] * cosines[1], -sines[0] * sines[1], cosines[0]],
-            [cosines[0] * cosines[1], cosines[0] * sines[1], sines[0]],
-        ]
-    )
-    return (_earth_centered(degrees) - _earth_centered(middle[None])) @ axes.T
-
-
-def _earth_centered(degrees: Float64[Array, "n 3"]) -> Float64[Array, "n 3"]:
-    latitude, longitude = np.radians(degrees[:, 0]), np.radians(degrees[:, 1])
-    normal = _SEMI_MAJOR_AXIS / np.sqrt(1 - _ECCENTRICITY_2 * np.sin(latitude) ** 2)
-    across = (normal + degrees[:, 2]) * np.cos(latitude)
-    along = (normal * (1 - _ECCENTRICITY_2) + degrees[:, 2]) * np.sin(latitude)
-    return np.stack([across * np.cos(longitude), across * np.sin(longitude), along], axis=1)
+    pycolmap = load_pycolmap()
+    earth = pycolmap.GPSTransform(pycolmap.GPSTransformEllipsoid.WGS84)
+    meters: Float64[Array, "n 3"] = earth.ellipsoid_to_enu(degrees, *middle)
+    return meters
 
 
 def _ground_axes(up: Float64[Array, "3"]) -> tuple[Float64[Array, "3"], Float64[Array, "3"]]:

@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
 LEAST_MATCHES = 15
 """Fewest verified matches of a pair of photos that is considered, as in COLMAP's mapper."""
+_ERROR = 0.004
+"""Largest error in pixels of a match that agrees with a rotation, relative to the photo's longer side."""
 APART = 20.0
 """Degrees between the measured and the model's rotation above which they contradict each other."""
 
@@ -34,7 +36,7 @@ class MatchedPair:
     first: int
     second: int
     matches: int
-    """Number of verified matches."""
+    """Number of matches that agree on the rotation."""
     turn: Float[Array, "3 3"]
     """Rotation from the first camera to the second."""
 
@@ -69,8 +71,9 @@ def doubtful_placements(
 
 
 def matched_pairs(database: pycolmap.Database, cameras: Mapping[int, pycolmap.Camera]) -> list[MatchedPair]:
-    """List the verified pairs among photos with these cameras (by the photos' numbers), except those without
-    depth or with few matches."""
+    """List the verified pairs among photos with these cameras (by the photos' numbers), except those with few
+    matches. Rotations follow from the lenses: fundamental matrices without them, as the database has, leave
+    them open where matches lie on one wall."""
     pycolmap = load_pycolmap()
     points = {number: database.read_keypoints(number)[:, :2].astype(float) for number in cameras}
     found = []
@@ -78,13 +81,15 @@ def matched_pairs(database: pycolmap.Database, cameras: Mapping[int, pycolmap.Ca
         first, second = pycolmap.pair_id_to_image_pair(key)
         if matches < LEAST_MATCHES or first not in cameras or second not in cameras:
             continue
-        geometry = database.read_two_view_geometry(first, second)
-        measured = pycolmap.estimate_two_view_geometry_pose(
-            cameras[first], points[first], cameras[second], points[second], geometry
-        )
-        if measured and geometry.cam2_from_cam1 is not None:
-            turn = geometry.cam2_from_cam1.rotation.matrix()
-            found.append(MatchedPair(first, second, int(matches), turn))
+        ends = np.asarray(database.read_two_view_geometry(first, second).inlier_matches)
+        pixels = points[first][ends[:, 0]], points[second][ends[:, 1]]
+        seen_by = cameras[first], cameras[second]
+        error = _ERROR * max(max(camera.width, camera.height) for camera in seen_by)
+        ransac = {"max_error": error, "min_num_trials": 100, "random_seed": 0}
+        measured = pycolmap.estimate_essential_matrix(*pixels, *seen_by, ransac)
+        if measured and measured["num_inliers"] >= LEAST_MATCHES:
+            turn = measured["cam2_from_cam1"].rotation.matrix()
+            found.append(MatchedPair(first, second, measured["num_inliers"], turn))
     return found
 
 

@@ -27,7 +27,7 @@ from lang3dxl_ns.common.errors import DAMAGE, UserError, is_plain
 from lang3dxl_ns.common.files import expanded, locked, read_json, replace_file
 from lang3dxl_ns.common.memory import machine_memory
 from lang3dxl_ns.common.pictures import open_picture
-from lang3dxl_ns.common.reports import measure, part
+from lang3dxl_ns.common.reports import timed
 from lang3dxl_ns.scene.camera_picture import camera_picture
 from lang3dxl_ns.scene.colmap import load_pycolmap
 from lang3dxl_ns.scene.companions import cache_folder
@@ -55,14 +55,11 @@ from lang3dxl_ns.scene.reconstruction import (
     ReconstructionSettings,
     picture_line,
 )
-from lang3dxl_ns.scene.symmetry import without_contradictions
+from lang3dxl_ns.scene.symmetry import contradictions, copy_without
 
 if TYPE_CHECKING:
     import pycolmap
 
-_DOUBTED = 0.1
-"""Share of doubtful photos above which a model is mapped anew without contradicting pairs. Honest models have
-fewer, and would lose a third of their photos."""
 _MEMORY_PER_THREAD = 1e9  # bytes that SIFT takes on a photo of 1600 pixels, the default `max_size`
 _FEW_FEATURES = 50
 _SMALLEST_MODEL = 3  # photos; COLMAP's default of ten may exceed the number of photos
@@ -88,17 +85,19 @@ def reconstruct(
     say(f"{len(photos.names)} photos in {photos.folder}, without a COLMAP model: reconstructing")
     good, left_out = usable(photos)
     _check_enough(photos, good, left_out)
-    with quiet(), measure() as clock:
-        with part("features"):
+    spent: dict[str, float] = {}
+    with quiet():
+        with timed(spent, "features"):
             copies = numbered(good, work)
             database = feature_database(good, copies, work, settings)
             extract(database, copies, settings)
-        with part("matching"):
+        with timed(spent, "matching"):
             match(database, copies.names, settings)
-        with part("mapping"):
-            models, contradicting = _map(database, copies, work, settings.mapper), 0
-            if models and len(_doubts(database, models[0])) > _DOUBTED * models[0].num_reg_images():
-                models, contradicting = _map_consistent(database, models, copies, work, settings.mapper)
+        with timed(spent, "mapping"):
+            models = _map(database, copies, work, settings.mapper)
+            contradicting = contradictions(database, cameras_of(models[0])) if models else set()
+            if contradicting:
+                models = _map_without(contradicting, database, copies, work, settings.mapper) or models
     features, partners = _features_and_partners(database)
     if not models:
         raise UserError(_why_no_model(features, partners))
@@ -112,10 +111,10 @@ def reconstruct(
         photos=len(photos.names), registered=best.num_reg_images(), points=best.num_points3D(),
         error=float(best.compute_mean_reprojection_error()),
         cameras=len({image.camera_id for image in best.images.values() if image.has_pose}),
-        mapper=settings.mapper, contradicting=contradicting, doubtful=doubtful,
+        mapper=settings.mapper, contradicting=len(contradicting), doubtful=doubtful,
         left_out=left_out | {names[number]: why for number, why in reasons.items()},
         other_models=tuple(other.num_reg_images() for other in models[1:]),
-        seconds={stage: round(sum(spent), 1) for stage, spent in clock.items()},
+        seconds={stage: round(seconds, 1) for stage, seconds in spent.items()},
     )  # fmt: skip
     _publish(models, model)
     write_picture(best, doubtful, work)
@@ -333,20 +332,18 @@ def _doubts(database: Path, model: pycolmap.Reconstruction) -> dict[int, str]:
         return doubtful_placements(rotations_of(model), matched_pairs(db, cameras_of(model)))
 
 
-def _map_consistent(
-    database: Path, models: list[pycolmap.Reconstruction], photos: PhotoFolder, work: Path, kind: str
-) -> tuple[list[pycolmap.Reconstruction], int]:
-    """Map anew without the pairs that contradict others, and return the models and the number of pairs left
-    out; the models as they are if that makes none."""
+def _map_without(
+    pairs: Collection[tuple[int, int]], database: Path, photos: PhotoFolder, work: Path, kind: str
+) -> list[pycolmap.Reconstruction]:
+    """Map without some pairs."""
     say(
-        "many photos contradict their places, as on a building that looks alike from several "
-        "sides: mapping anew"
+        f"{len(pairs)} pairs of photos contradict others, as on a building that looks alike from several "
+        "sides: mapping anew without them"
     )
     with TemporaryDirectory(dir=work) as folder:
         consistent = Path(folder) / "database.db"
-        contradicting = without_contradictions(database, consistent, cameras_of(models[0]))
-        found = _map(consistent, photos, work, kind)
-    return (found, contradicting) if found else (models, 0)
+        copy_without(pairs, database, consistent)
+        return _map(consistent, photos, work, kind)
 
 
 def _publish(models: list[pycolmap.Reconstruction], model: Path) -> None:

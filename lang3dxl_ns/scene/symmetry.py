@@ -3,15 +3,14 @@
 A single pair doesn't tell: two towers match as two views of one tower do. But its rotation contradicts those
 of other pairs, around the building and through photos that see both sides. The photos are joined into groups,
 along the best supported rotations first; a pair that contradicts its group is left out of the mapping.
-Groups between which too many pairs disagree stay apart. Honest pairs are lost on the way, so this is meant
-for models that many photos contradict.
+Groups between which too many pairs disagree stay apart.
 """
 
 from __future__ import annotations
 
 import sqlite3
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,6 +32,9 @@ APART = 40.0
 are guesses before mapping, which turns rotations by up to about half of this."""
 AGREEMENT = 0.55
 """Share of the matches between two groups that has to agree on a rotation, or else the groups stay apart."""
+SYMMETRIC = 0.05
+"""Share of contradicting matches above which a building has sides that look alike: honest collections have a
+hundredth, generated landmarks a tenth and more."""
 _VOTES = 30
 """Strongest pairs between two groups that vote on the rotation between them."""
 _VOICES = 3
@@ -58,21 +60,29 @@ class _Groups:
             self.rotation[photo] = self.rotation[photo] @ turn.T
 
 
-def without_contradictions(database: Path, copy: Path, known: Mapping[int, pycolmap.Camera]) -> int:
-    """Copy COLMAP's database without the pairs whose rotations contradict others, and return their number.
+def contradictions(database: Path, known: Mapping[int, pycolmap.Camera]) -> set[tuple[int, int]]:
+    """Find the pairs of photos in COLMAP's database whose rotations contradict others; none if their matches
+    are few, as on buildings without symmetry.
 
     Args:
-        database: with verified pairs. copy: file to write. known: cameras of an earlier model, by the photos'
-            numbers, whose focal lengths are better than the database's guesses.
+        known: cameras of an earlier model, by the photos' numbers, whose focal lengths are better than the
+            database's guesses.
     """
+    with load_pycolmap().Database.open(database) as db:
+        cameras = {image.image_id: db.read_camera(image.camera_id) for image in db.read_all_images()}
+        pairs = matched_pairs(db, cameras | dict(known))
+    found = contradicting_pairs(pairs)
+    matches = sum(pair.matches for pair in pairs if (pair.first, pair.second) in found)
+    return found if matches > SYMMETRIC * sum(pair.matches for pair in pairs) else set()
+
+
+def copy_without(pairs: Collection[tuple[int, int]], database: Path, copy: Path) -> None:
+    """Write a copy of COLMAP's database that lacks the geometry of some pairs."""
     with closing(sqlite3.connect(database)) as source, closing(sqlite3.connect(copy)) as target:
         source.backup(target)
     with load_pycolmap().Database.open(copy) as db:
-        cameras = {image.image_id: db.read_camera(image.camera_id) for image in db.read_all_images()}
-        contradicting = contradicting_pairs(matched_pairs(db, cameras | dict(known)))
-        for first, second in contradicting:
+        for first, second in pairs:
             db.delete_two_view_geometry(first, second)
-    return len(contradicting)
 
 
 def contradicting_pairs(pairs: Sequence[MatchedPair]) -> set[tuple[int, int]]:

@@ -13,11 +13,12 @@ from numpy import ndarray as Array
 from torch import Tensor
 
 from lang3dxl_ns.query.answering import Answering
-from lang3dxl_ns.query.doubt import doubtful, peaks
+from lang3dxl_ns.query.doubt import peaks
 from lang3dxl_ns.query.question import Question
+from lang3dxl_ns.query.trust import FAR
 from lang3dxl_ns.rendering import composite
 from lang3dxl_ns.scene.camera import seen_from
-from lang3dxl_ns.things.join import VIEWS, Joined, join, stacked, without_crumbs
+from lang3dxl_ns.things.join import VIEWS, Joined, grown, join, stacked, without_crumbs
 from lang3dxl_ns.things.pieces import FILLED, LEVELS, Piece, Shown, pieces_of
 from lang3dxl_ns.things.thing import Box, Sighting, Thing, upright_box
 
@@ -25,6 +26,9 @@ COLORED = 20
 """Number of Gaussians within and around the matches below which colors tell nothing."""
 SAMPLED = 50_000
 """Number of Gaussians, each of matches and of others, from which only every second one tells colors."""
+PAIRED, NEIGHBORS = 1_000, 3.0
+"""Number of Gaussians, about, whose directions from each other tell where walls run, and their largest
+distance, relative to the gap between groups."""
 _KNOWN: WeakKeyDictionary[Answering, list[Thing]] = WeakKeyDictionary()
 """Things that were found in each scene so far: they keep their ids."""
 SAME = 0.5
@@ -40,7 +44,7 @@ class Things:
     candidates: list[Thing] = field(default_factory=list)
     """Further things, perhaps: those that a single photo shows, and small ones."""
     caution: str | None = None
-    """Why the answer is doubtful; None if it isn't."""
+    """Why the answer is doubtful, or counts are; None if neither is."""
 
     @property
     def sure(self) -> list[Thing]:
@@ -74,7 +78,7 @@ def things_of(scene: Answering, question: Question) -> list[Things]:
     scene found keeps its id.
     """
     mass = scene.mass.double().cpu().numpy()
-    means, up = scene.splats.means.double().cpu().numpy(), up_of(scene)
+    means, axes = scene.splats.means.double().cpu().numpy(), axes_of(scene)
     sharp = [_sharpened(scene, relevancy) for relevancy in question.relevancy]
     # A word whose peak stays below the lowest level names nothing here.
     present = (peaks(question.relevancy) > LEVELS[0]).tolist()
@@ -84,21 +88,21 @@ def things_of(scene: Answering, question: Question) -> list[Things]:
             found += pieces_of(shown) if there else []
 
     def box(one: Joined, weight: Float[Array, " n"]) -> Box:
-        return upright_box(means[one.rows], weight[one.rows], up)
+        return upright_box(means[one.rows], weight[one.rows], axes)
 
     answers, known = list[Things](), _KNOWN.setdefault(scene, [])
     for i, prompt in enumerate(question.prompts):
         values = question.relevancy[i].double().cpu().numpy()
         weight = np.sqrt(mass) * values
         parts = join(pieces[i], weight)
-        joined = stacked(parts, [box(part, weight) for part in parts])
+        joined = grown(stacked(parts, [box(part, weight) for part in parts]), len(weight))
         sure = [one for one in without_crumbs(joined) if one.views >= VIEWS]
-        listed = [_thing(prompt.text, one, box(one, weight), mass, values)
+        listed = [_known(_thing(prompt.text, one, box(one, weight), mass, values), known, mass)
                   for one in [*sure, *(one for one in joined if one not in sure)]]  # fmt: skip
-        listed = [_known(thing, known, mass) for thing in listed]
         things, candidates = listed[: len(sure)], listed[len(sure) :]
         known += [thing for thing in things if all(thing.id != other.id for other in known)]
-        caution = doubtful(prompt.text, question.doubts[i], prompt.taught is not None)
+        trust, far = question.trusts[i], (scene.foreignness or 0) >= FAR and prompt.taught is None
+        caution = trust.reason if far or trust.level != "sure" else None
         answers.append(Things(prompt.text, things, candidates, caution))
     return answers
 
@@ -109,6 +113,20 @@ def up_of(scene: Answering) -> Float[Array, "3"]:
     up = np.array([photo.camera_to_world for photo in scene.photos])[:, :, 1].mean(0)
     up = up if told is None else np.asarray(told.up, dtype=np.float64)
     return up / max(np.linalg.norm(up), 1e-9)
+
+
+def axes_of(scene: Answering) -> Float[Array, "3 3"]:
+    """Return the directions of all boxes' edges, one a row: along the walls, across them, and up. Walls
+    seen from above are lines, a quarter turn apart: Gaussians on one lie in its direction from each other."""
+    up = up_of(scene)
+    plane = np.linalg.svd(up[None])[2][1:]
+    heavy = (scene.mass > scene.mass.median() / 2).nonzero()[:, 0]
+    points = scene.splats.means[heavy[:: 1 + len(heavy) // PAIRED]].double().cpu().numpy()
+    apart = (points[:, None] - points).reshape(-1, 3)
+    way = apart[np.linalg.norm(apart, axis=1) < NEIGHBORS * scene.gap] @ plane.T @ (1, 1j)
+    turn = np.angle((way**4 / np.maximum(abs(way), 1e-9) ** 3).sum()) / 4  # the same for a quarter turn
+    along = (np.cos(turn), np.sin(turn)) @ plane
+    return np.stack([along, np.cross(up, along), up])
 
 
 def _sharpened(scene: Answering, relevancy: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
@@ -131,9 +149,8 @@ def _sharpened(scene: Answering, relevancy: Float[Tensor, " n"]) -> Float[Tensor
     weight = np.sqrt(mass[rows]) * len(rows) / 2
     weight[: len(match)] /= np.sqrt(mass[match]).sum()
     weight[len(match) :] /= np.sqrt(mass[around]).sum()
-    model = LogisticRegression(C=10).fit(
-        colors[rows], np.arange(len(rows)) < len(match), sample_weight=weight
-    )
+    matches = np.arange(len(rows)) < len(match)
+    model = LogisticRegression(C=10).fit(colors[rows], matches, sample_weight=weight)
     return relevancy * torch.from_numpy(model.predict_proba(colors)[:, 1]).to(relevancy)
 
 
@@ -155,9 +172,8 @@ def _views(scene: Answering, heat: Float[Tensor, "n q"]) -> Iterator[list[Shown]
         lens = camera.intrinsics.cpu().numpy()
         points = np.column_stack([(points / points[:, 2:]) @ lens[:2].T, points[:, 2]])
         *matched, surface = depths / np.maximum(maps, 1e-4)
-        focal = float(lens[0, 0])
         yield [
-            Shown(name, one, surface, depth, rows, points, focal)
+            Shown(name, one, surface, depth, rows, points, float(lens[0, 0]))
             for one, depth in zip(maps[:-1] * keep, matched, strict=True)
         ]
 
@@ -171,8 +187,7 @@ def _thing(
         best.setdefault(piece.photo, piece)
     score = float(np.average(relevancy[rows], weights=np.maximum(mass[rows], 1e-9)))
     sightings = [Sighting(name, piece.box) for name, piece in best.items()]
-    number = int(rows[mass[rows].argmax()])
-    return Thing(number, word, score, one.views, *box, rows, sightings)
+    return Thing(int(rows[mass[rows].argmax()]), word, score, one.views, *box, rows, sightings)
 
 
 def _known(thing: Thing, known: Sequence[Thing], mass: Float[Array, " n"]) -> Thing:

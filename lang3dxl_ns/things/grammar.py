@@ -24,7 +24,6 @@ BESIDE = 1.5
 """Distance, relative to the mean longest edge of two things, up to which they are next to each other."""
 INSIDE = 0.7
 """Half-size of a box, relative to its own edges, within which a center is in or on it."""
-
 CLOSE = 1.3
 """Ratio of two sizes below which either may be the larger one."""
 
@@ -149,9 +148,8 @@ def answer(request: Request, found: Sequence[Things], sight: Facing) -> list[Thi
         for word in request.others:
             if not things[word]:
                 raise UserError(f"no {word} found: a relation to it has no answer")
-        chosen = [
-            t for t in chosen if _related(t, request.relation, [things[w] for w in request.others], view)
-        ]
+        others = [things[word] for word in request.others]
+        chosen = [t for t in chosen if _related(t, request.relation, others, view)]
     if request.superlative:
         kind, sign = table()["superlatives"][request.superlative]
         return sorted(chosen, key=lambda thing: sign * measure(thing, kind, view))[:1]
@@ -213,9 +211,7 @@ def measure(thing: Thing, kind: str, view: Sight) -> float:
 
 def _related(thing: Thing, relation: str, others: list[list[Thing]], view: Sight) -> bool:
     if relation == "between":
-        pairs = [
-            (a, b) for a in others[0] for b in others[-1] if a.id != b.id and thing.id not in (a.id, b.id)
-        ]
+        pairs = [(a, b) for a in others[0] for b in others[-1] if len({a.id, b.id, thing.id}) == 3]
         return any(_between(thing, a, b) for a, b in pairs)
     return any(holds(thing, relation, other, view) for other in others[0] if other.id != thing.id)
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from itertools import combinations
+from dataclasses import dataclass, field, replace
+from itertools import combinations, pairwise
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -30,8 +31,6 @@ SLIM = 4.0
 """Height, relative to its width, from which a thing is one with what stands on or below it."""
 STRAIGHT = 1.5
 """Distance of the two from one plumb line, relative to the slim one's width, up to which they are one."""
-MOST_SHARED = 0.5
-"""Share of a piece's weight that may belong to known things if it is to be a new one."""
 
 
 @dataclass(eq=False)
@@ -55,11 +54,11 @@ def join(pieces: Sequence[Piece], weight: Float[Array, " n"]) -> list[Joined]:
 
     A piece founds a thing if its Gaussians are mostly free, confirms the thing that it shares most with, and
     says nothing if it covers several things (a coarse view joins neighbors that a fine one tells apart), or
-    if it is cut off and new. Things that some piece covers together, and no photo shows apart, are one: two
-    sides of a tower. `weight` is each Gaussian's weight, 0 and above.
+    if it is cut off and new. A thing is one with the heavier one that most pieces cover together with it and
+    no photo shows apart from it: two sides of a tower. `weight` is each Gaussian's weight, 0 and above.
     """
     owner, things = np.full(len(weight), -1), list[Joined]()
-    together = set[tuple[int, int]]()
+    together = Counter[tuple[int, int]]()
     for piece in sorted(pieces, key=lambda piece: (piece.cut, -piece.resolution)):
         mine, total = owner[piece.rows], weight[piece.rows].sum()
         if total <= 0:
@@ -74,16 +73,38 @@ def join(pieces: Sequence[Piece], weight: Float[Array, " n"]) -> list[Joined]:
         if things and (shared[best] > SHARED * total or of_things[best] > SHARED):
             if of_things[best] >= SPLINTER and not (piece.cut and of_things[best] <= SHARED):
                 things[best].votes.append(piece)
-        elif not piece.cut and shared.sum() <= MOST_SHARED * total:
+        elif not piece.cut and shared.sum() <= SHARED * total:
             rows = piece.rows[mine < 0]
             owner[rows] = len(things)
             things.append(Joined(rows, float(weight[rows].sum()), [piece]))
     return [thing for thing in _united(things, together) if len(thing.rows) > 1]
 
 
-def _united(things: Sequence[Joined], together: set[tuple[int, int]]) -> list[Joined]:
+def _united(things: Sequence[Joined], together: Counter[tuple[int, int]]) -> list[Joined]:
     photos = [{piece.photo for piece in thing.votes} for thing in things]
-    return _grouped(things, [(a, b) for a, b in sorted(together) if not photos[a] & photos[b]])
+    best: dict[int, tuple[int, int]] = {}
+    # One partner each: crumbs between two towers would otherwise make one of them.
+    for pair, times in sorted(together.items()):
+        heavy, light = sorted(pair, key=lambda i: (-things[i].weight, i))
+        if not photos[heavy] & photos[light] and times > best.get(light, (0, 0))[0]:
+            best[light] = times, heavy
+    return _grouped(things, [(light, heavy) for light, (_, heavy) in best.items()])
+
+
+def grown(things: Sequence[Joined], count: int) -> list[Joined]:
+    """Give each of `count` Gaussians to the thing of which most pieces show it, at least two, where the one
+    that founded a thing counts twice: other sides of a dome join the one that was seen first."""
+    owner, most = np.full(count, -1), np.ones(count, int)
+    for i, thing in enumerate(things):
+        rows, times = np.unique(
+            np.concatenate([thing.rows, *(p.rows for p in thing.votes)]), return_counts=True
+        )
+        rows, times = rows[times > most[rows]], times[times > most[rows]]
+        owner[rows], most[rows] = i, times
+    order = owner.argsort(kind="stable")
+    ends = np.searchsorted(owner[order], np.arange(len(things) + 1))
+    parts = zip(things, pairwise(ends), strict=True)
+    return [replace(one, rows=order[a:b]) for one, (a, b) in parts if b > a + 1]
 
 
 def stacked(things: Sequence[Joined], boxes: Sequence[Box]) -> list[Joined]:

@@ -11,9 +11,6 @@ from numpy import ndarray as Array
 
 OUTLIERS = 0.03
 """Share of a thing's weight that its box leaves out at either end of each axis."""
-TURNS = 30
-"""Number of directions that are tried for a box, over a quarter turn."""
-
 
 Box = tuple[Float[Array, "3"], Float[Array, "3 3"], Float[Array, "3"]]
 """Center, axes and size of an upright box, as `Thing` has them."""
@@ -63,20 +60,10 @@ class Thing:
                 **numbers, "gaussians": len(self.rows), "photos": seen}  # fmt: skip
 
 
-def upright_box(points: Float[Array, "m 3"], weight: Float[Array, " m"], up: Float[Array, "3"]) -> Box:
-    """Find the upright box with the smallest base around weighted points. `up` is a unit vector."""
-    aside = np.cross(up, np.eye(3)[abs(up).argmin()])
-    aside /= np.linalg.norm(aside)
-    ahead = np.cross(up, aside)
-    boxes = []
-    for angle in np.arange(TURNS) * (np.pi / 2 / TURNS):
-        level = np.cos(angle) * aside + np.sin(angle) * ahead
-        axes = np.stack([level, np.cross(up, level), up])
-        ends = np.stack([_ends(along, weight) for along in (points @ axes.T).T])
-        size = ends[:, 1] - ends[:, 0]
-        boxes.append((size[0] * size[1], size[0] + size[1], angle, ends.mean(1) @ axes, axes, size))
-    *_, center, axes, size = min(boxes, key=lambda box: box[:3])
-    return center, axes, size
+def upright_box(points: Float[Array, "m 3"], weight: Float[Array, " m"], axes: Float[Array, "3 3"]) -> Box:
+    """Find the box around weighted points along `axes`: unit vectors, one a row, of which the last is up."""
+    ends = np.stack([_ends(along, weight) for along in (points @ axes.T).T])
+    return ends.mean(1) @ axes, axes, ends[:, 1] - ends[:, 0]
 
 
 def _ends(values: Float[Array, " m"], weight: Float[Array, " m"]) -> Float[Array, "2"]:

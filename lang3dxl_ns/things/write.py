@@ -33,7 +33,6 @@ def write_catalog(scene: Scene, answers: Sequence[Things], folder: Path) -> None
     things.csv and instances.json (COCO boxes in all photos)."""
     make_folder(folder)
     things = _each_once(answers)
-    up = up_of(scene)
     graph = _relations(things, sight_of(scene, things))
     words = [{"word": one.word, "count": len(one.things), "least": one.least, "most": one.most,
               "caution": one.caution, "things": [thing.id for thing in one.things]}
@@ -41,14 +40,15 @@ def write_catalog(scene: Scene, answers: Sequence[Things], folder: Path) -> None
     place = scene.file.georeference
     meters = [None if place is None else (place.meters * t.size).round(2).tolist() for t in things]
     listed = [t.as_json() | {"meters": size} for t, size in zip(things, meters, strict=True)]
-    content = {"words": words, "things": listed, "relations": graph, "up": up.tolist()}
+    content = {"words": words, "things": listed, "relations": graph, "up": up_of(scene).tolist()}
     content["unit"] = None if place is None else asdict(place)
     write_atomically(folder / "things.json", json.dumps(content, indent=1) + "\n")
     rows = io.StringIO()
     table = csv.writer(rows, lineterminator="\n")
     sides = ["width", "depth", "height"]
-    named = ["id", "word", "score", "views", "x", "y", "z", *sides, "photo", *(f"{side}_m" for side in sides)]
-    table.writerow(named)
+    table.writerow(
+        ["id", "word", "score", "views", *"xyz", *sides, "photo", *(f"{side}_m" for side in sides)]
+    )
     for thing, size in zip(things, meters, strict=True):
         seen = thing.sightings[0].photo if thing.sightings else ""
         numbers = [*thing.center.round(4).tolist(), *thing.size.round(4).tolist(), seen, *(size or [""] * 3)]

@@ -30,7 +30,7 @@ from lang3dxl_ns.scene.photo_folder import check_data
 from lang3dxl_ns.training.batches import TrainingData, settle
 from lang3dxl_ns.training.checkpoint import CHECKPOINT, as_damage, read_checkpoint, save_checkpoint
 from lang3dxl_ns.training.estimate import check_device, estimate
-from lang3dxl_ns.training.learn_codes import forget_words, learn_words
+from lang3dxl_ns.training.learn_codes import begin_codes, forget_words, learn_words
 from lang3dxl_ns.training.learning_rates import Rates, learning_rates, printed_learning_rates
 from lang3dxl_ns.training.memory import out_of_memory, plan
 from lang3dxl_ns.training.settings import PRINTED_PHOTO_SCALE, TrainingSettings, as_printed
@@ -132,10 +132,7 @@ class Run:
         """Train one iteration."""
         state, data = self.state, self.data
         state.step = step
-        if state.codes_begin:
-            if self.settings.scene.codes_from == "photos":
-                self.learn_words()
-            state.codes_have_begun = True
+        begin_codes(state, data)
         for optimizer in self.optimizers.values():
             optimizer.zero_grad()
         view, batch = data.next()
@@ -153,10 +150,6 @@ class Run:
         for scheduler in self.schedulers.values():
             scheduler.step()
         finish(state)
-
-    def learn_words(self) -> None:
-        """Give the Gaussians codes that represent the photos' targets."""
-        learn_words(self.state, self.data.every_photo(), len(self.data.cameras))
 
     def scene(self) -> Scene:
         """Return the scene so far, which later training doesn't change."""
@@ -247,7 +240,7 @@ class Run:
         """Learn words, which a checkpoint precedes."""
         try:
             with stages.stage("words"):
-                self.learn_words()
+                learn_words(self.state, self.data)
         except KeyboardInterrupt:
             say("Stopped while words were learned; all iterations are kept. To resume: the same command")
             raise

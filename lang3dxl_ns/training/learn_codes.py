@@ -19,6 +19,7 @@ from lang3dxl_ns.preparation.targets import Batch, foreground
 from lang3dxl_ns.rendering import composite
 from lang3dxl_ns.rendering.gathering import Composite, Pixels, gather
 from lang3dxl_ns.scene.camera import resized
+from lang3dxl_ns.training.batches import TrainingData
 from lang3dxl_ns.training.sharpening import sharpen
 from lang3dxl_ns.training.state import PhotoCamera, Training
 
@@ -47,14 +48,25 @@ class TargetView:
     """Foreground; None if it is the whole photo."""
 
 
-def learn_words(run: Training, photos: Iterable[tuple[PhotoCamera, Batch]], count: int) -> None:
-    """Give a run's Gaussians codes that represent the targets of this number of photos; see `learn_codes`."""
+def begin_codes(run: Training, data: TrainingData) -> None:
+    """Let codes begin where the warm-up ends, from the photos' features if the settings say so."""
+    if run.codes_begin:
+        if run.settings.codes_from == "photos":
+            learn_words(run, data)
+        run.codes_have_begun = True
+
+
+def learn_words(run: Training, data: TrainingData) -> None:
+    """Give a run's Gaussians codes that represent the targets of its photos; see `learn_codes`."""
     semantics, facts = run.parts.semantics, run.facts
     assert semantics is not None and facts.clip_targets is not None
-    views, means = (_target_view(run, *photo) for photo in photos), run.gaussians["means"].detach()
+    views, means = (
+        (_target_view(run, *photo) for photo in data.every_photo()),
+        run.gaussians["means"].detach(),
+    )
     # Initial codes are fitted to the unsharpened targets, which the loss compares with.
     dense = None if run.learns_from_renderings else facts.dense_targets
-    codes = learn_codes(semantics.decoder, views, count, means, facts.clip_targets, dense)
+    codes = learn_codes(semantics.decoder, views, len(data.cameras), means, facts.clip_targets, dense)
     if run.learns_from_renderings:
         run.gaussians["codes"].data.copy_(codes.nan_to_num(0.0))
     else:

@@ -14,7 +14,6 @@ from torch.nn import Parameter
 from lang3dxl_ns.common.device import to_device
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.options import data_option, model_option
-from lang3dxl_ns.common.reports import part
 from lang3dxl_ns.components.appearance import AppearanceField
 from lang3dxl_ns.components.compression import CompressedField
 from lang3dxl_ns.components.decoders import make_decoder
@@ -199,8 +198,7 @@ def build_semantics(
     decoder.set_output_statistics(
         torch.cat([clip.mean, dense_mean]), clip.std if dense is None else torch.cat([clip.std, dense.std])
     )
-    with part("learn targets"):
-        decoder.learn_targets(targets)
+    decoder.learn_targets(targets)
     return _with_codes(decoder, clip.mean, dense_mean, settings, gaussians)
 
 

@@ -15,7 +15,6 @@ from torch import Tensor
 
 from lang3dxl_ns.common.device import to_device
 from lang3dxl_ns.common.image import fitted_size, resize_nearest
-from lang3dxl_ns.common.reports import part
 from lang3dxl_ns.components import losses as compared
 from lang3dxl_ns.preparation.targets import Batch, foreground
 from lang3dxl_ns.rendering import rasterize
@@ -54,8 +53,7 @@ def render(run: Training, view: PhotoCamera) -> Rendered:
         vector = _look(run, view, pose)
         near = camera.detach().to(run.device)
         visible = in_view(near, gaussians.means, gaussians.scales).nonzero().squeeze(1)
-        with part("appearance"):
-            colors, in_photo = parts.appearance(gaussians, colors, vector, visible, run.step)
+        colors, in_photo = parts.appearance(gaussians, colors, vector, visible, run.step)
     how: dict[str, Any] = {"backend": run.backend, "antialiased": run.antialiased}
     photo = rasterize(in_photo.seen_from(camera), camera, colors, background, **how)
     if photo.info["means2d"].requires_grad:
@@ -104,9 +102,8 @@ def losses(
     """Compare what `render` returns with the photo and its targets: compute the color loss and, if there are
     codes, the semantic losses, all already weighted."""
     mask = foreground(batch)
-    with part("losses"):
-        photo = to_device(batch["image"], run.device).float() / 255.0
-        loss = {"rgb": compared.rgb_loss(rgb, photo, mask, run.settings.ssim_lambda)}
+    photo = to_device(batch["image"], run.device).float() / 255.0
+    loss = {"rgb": compared.rgb_loss(rgb, photo, mask, run.settings.ssim_lambda)}
     if run.parts.cameras is not None:
         loss["camera_opt_regularizer"] = run.parts.cameras.penalty()
     if codes is not None and "clip_target" in batch:
@@ -120,24 +117,21 @@ def _semantic_losses(
     c, semantics = run.settings, run.parts.semantics
     assert c.dense_weight is not None and semantics is not None
     ramp = semantic_ramp(run.step / c.total_steps, c.semantic_ramp)
-    with part("decode"):
-        clip, dense = semantics.decoder(codes)
+    clip, dense = semantics.decoder(codes)
     small_mask = None if mask is None else resize_nearest(mask, (codes.shape[0], codes.shape[1]))
-    with part("downsample"):
-        predicted, target, weight = semantics.downsampler.match(
-            clip, batch["clip_target"], batch["crop_sides"], small_mask
-        )
-    with part("losses"):
-        # Cells with little foreground have a low weight.
-        difference = compared.clip_loss(predicted, target, None if small_mask is None else weight)
-        loss = {"clip": ramp * c.clip_weight * difference}
-        if dense is not None and "dense_target" in batch:
-            difference = compared.dense_loss(dense, batch["dense_target"])
-            loss["dense"] = ramp * c.dense_weight * difference
-        if "regions" in batch:
-            labels = resize_nearest(batch["regions"], (clip.shape[0], clip.shape[1]))
-            loss["regions"] = c.region_weight * compared.region_variance_loss(clip, labels, small_mask)
-        own = semantics.decoder.own_losses(clip, dense)
+    predicted, target, weight = semantics.downsampler.match(
+        clip, batch["clip_target"], batch["crop_sides"], small_mask
+    )
+    # Cells with little foreground have a low weight.
+    difference = compared.clip_loss(predicted, target, None if small_mask is None else weight)
+    loss = {"clip": ramp * c.clip_weight * difference}
+    if dense is not None and "dense_target" in batch:
+        difference = compared.dense_loss(dense, batch["dense_target"])
+        loss["dense"] = ramp * c.dense_weight * difference
+    if "regions" in batch:
+        labels = resize_nearest(batch["regions"], (clip.shape[0], clip.shape[1]))
+        loss["regions"] = c.region_weight * compared.region_variance_loss(clip, labels, small_mask)
+    own = semantics.decoder.own_losses(clip, dense)
     return loss | {name: ramp * value for name, value in own.items()}
 
 

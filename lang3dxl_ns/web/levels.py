@@ -7,7 +7,7 @@ shows a quarter of its rows in more detail. Chunk 0 is the whole scene, coarsely
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -85,9 +85,8 @@ def levels_of(scene: Scene, most: int = MOST_ROWS) -> Levels:
     splats = replace(splats, means=means, quats=quats, opacities=splats.opacities * visible)
     order = tree_order(splats, _meaning(scene)[filled])
     splats, origin = splats.select(order), filled[order]
-    place = order.argsort()[:count]
     codes = None if scene.codes is None else torch.where(visible[order, None], scene.codes[origin], torch.nan)
-    floats = scene.floating[origin]
+    floats, place = scene.floating[origin], order.argsort()[:count]
     found = []
     for level in range(depth + 1):
         if level:
@@ -114,24 +113,22 @@ def tree_order(splats: Splats, meaning: Float[Tensor, "n d"]) -> Int[Tensor, " n
     `meaning`. These are paired by what merging adds to the variance (Ward's criterion), and so are the pairs.
     Gaussians weigh by the root of opacity times area, lest what is faint vanish in what is heavy.
     """
-    means, found = splats.means.double().cpu().numpy(), []
+    means, meant, found = splats.means.double().cpu().numpy(), meaning.cpu().numpy(), []
     weights = (splats.opacities * _area(splats.scales)).sqrt().clamp_min(1e-12).double().cpu().numpy()
     for node in _halved(means, np.arange(len(means))):
         away = means[node] - means[node].mean(0)
         radius = max(np.sqrt(np.square(away).sum(1).mean()), 1e-12)
-        points = np.hstack([away / radius, meaning[node].cpu().numpy()])
+        points = np.hstack([away / radius, meant[node]])
         found.append(node[_tied(points, weights[node])])
     return torch.from_numpy(np.concatenate(found)).to(splats.means.device)
 
 
-def _halved(means: Float[Array, "n 3"], node: Int[Array, " s"]) -> Iterator[Int[Array, " 64"]]:
+def _halved(means: Float[Array, "n 3"], node: Int[Array, " s"]) -> list[Int[Array, " 64"]]:
     if len(node) <= _ALIGNED:
-        yield node
-        return
+        return [node]
     half, axis = _ALIGNED * (len(node) // (2 * _ALIGNED)), np.ptp(means[node], axis=0).argmax()
     order = node[np.argpartition(means[node, axis], half)]
-    yield from _halved(means, order[:half])
-    yield from _halved(means, order[half:])
+    return [*_halved(means, order[:half]), *_halved(means, order[half:])]
 
 
 def _tied(points: Float[Array, "s d"], weights: Float[Array, " s"]) -> Int[Array, " s"]:
@@ -149,8 +146,7 @@ def _pairs(costs: Float[Array, "s s"]) -> Int[Array, "p 2"]:
     """Pair rows: the best between two halves, and again after some have changed sides."""
     pairs = np.arange(len(costs)).reshape(-1, 2)
     for turn in range(2):
-        moved = (np.arange(len(pairs)) >> turn) % 2 == 1
-        one, other = np.where(moved[:, None], pairs[:, ::-1], pairs).T
+        one, other = np.where(np.arange(len(pairs))[:, None] >> turn & 1, pairs[:, ::-1], pairs).T
         pairs = np.stack([one, other[linear_sum_assignment(costs[np.ix_(one, other)])[1]]], 1)
     return pairs
 

@@ -3,19 +3,19 @@
 import language from "./language.js";
 import { fitted } from "./like.js";
 
-const { LEVELS, PART, DEPTH, FILLED, SHARED, SPLINTER, VIEWS, CRUMB, OFTEN, MOST_SHARED, OUTLIERS, TURNS, COLORED, SAME, SLIM, STRAIGHT } = language.things;
+const { LEVELS, PART, DEPTH, FILLED, SHARED, SPLINTER, VIEWS, CRUMB, OFTEN, OUTLIERS, COLORED, SAME, SLIM, STRAIGHT } = language.things;
 const SIDE = 240, LEAST = 3; // pixels of a view's longer side, and of the smallest piece
 const FAINT = 0.05, TRACE = 0.004, REACH = 2.5, BLUR = 0.3; // relevancy and heat that leave no trace, standard deviations that are drawn, square pixels
 const RIDGE = 0.1, ROUNDS = 12; // strength of the colors' regularization, Newton steps
 const DC = 0.28209479177387814; // of spherical harmonics: colors are compared as coefficients
 
 /** Find the things of a word: { things, candidates }, each largest first. views: as of find.js; scene: { centers, axes,
- * bytes (packed splats), mass, gap, up }, in one frame. */
+ * bytes (packed splats), mass, gap, edges (of boxes, a direction each) }, in one frame. */
 export function thingsOf(views, scene, relevancy) {
   const heat = sharpened(scene, relevancy), { mass } = scene;
   const weight = Float64Array.from(relevancy, (value, i) => Math.sqrt(mass[i]) * value);
   const parts = join(views.flatMap((view, v) => piecesOf(drawn(view, scene, heat), v)), weight);
-  const joined = stacked(parts, parts.map(({ rows }) => uprightBox(rows, scene.centers, weight, scene.up)));
+  const joined = grown(stacked(parts, parts.map(({ rows }) => uprightBox(rows, scene.centers, weight, scene.edges))), weight.length);
   const sure = new Set(withoutCrumbs(joined).filter((one) => photosOf(one).size >= VIEWS));
   const listed = (some) => some.map((one) => described(one, scene, weight, relevancy)).sort((a, b) => b.weight - a.weight);
   return { things: listed([...sure]), candidates: listed(joined.filter((one) => !sure.has(one))) };
@@ -46,7 +46,7 @@ export class Known {
 
 const photosOf = ({ votes }) => new Set(votes.map(({ view }) => view));
 
-function described({ rows, weight, votes }, { centers, mass, up }, weights, relevancy) {
+function described({ rows, weight, votes }, { centers, mass, edges }, weights, relevancy) {
   let id = rows[0], heavy = 0, sum = 0;
   for (const i of rows) {
     if (mass[i] > mass[id]) id = i;
@@ -56,7 +56,7 @@ function described({ rows, weight, votes }, { centers, mass, up }, weights, rele
   const best = new Map();
   for (const piece of [...votes].sort((a, b) => a.cut - b.cut || b.area - a.area)) if (!best.has(piece.view)) best.set(piece.view, piece.box);
   const seen = [...best].map(([view, box]) => ({ view, box }));
-  return { id, weight, views: seen.length, score: sum / heavy, rows: Uint32Array.from(rows).sort(), seen, ...uprightBox(rows, centers, weights, up) };
+  return { id, weight, views: seen.length, score: sum / heavy, rows: Uint32Array.from(rows).sort(), seen, ...uprightBox(rows, centers, weights, edges) };
 }
 
 // ── heat ──
@@ -195,7 +195,7 @@ export function split(map, width, height, least = LEAST) {
 
 /** Join the pieces of all views, from the finest resolution to the coarsest: see things/join.py. */
 export function join(pieces, weight) {
-  const owner = new Int32Array(weight.length).fill(-1), things = [], together = [];
+  const owner = new Int32Array(weight.length).fill(-1), things = [], together = new Map();
   for (const piece of [...pieces].sort((a, b) => a.cut - b.cut || b.resolution - a.resolution)) {
     const shared = new Map();
     let total = 0, taken = 0;
@@ -208,14 +208,14 @@ export function join(pieces, weight) {
     if (!(total > 0)) continue;
     const covered = [...shared].filter(([t, value]) => value > SHARED * things[t].weight).map(([t]) => t);
     if (covered.length > 1) {
-      for (const a of covered) for (const b of covered) if (a < b) together.push([a, b]);
+      for (const a of covered) for (const b of covered) if (a < b) together.set(`${a} ${b}`, (together.get(`${a} ${b}`) ?? 0) + 1);
       continue;
     }
     const [best, most] = [...shared].reduce((one, other) => (other[1] > one[1] || (other[1] === one[1] && other[0] < one[0]) ? other : one), [-1, 0]);
     const share = best < 0 ? 0 : most / things[best].weight;
     if (best >= 0 && (most > SHARED * total || share > SHARED)) {
       if (share >= SPLINTER && !(piece.cut && share <= SHARED)) things[best].votes.push(piece);
-    } else if (!piece.cut && taken <= MOST_SHARED * total) {
+    } else if (!piece.cut && taken <= SHARED * total) {
       const rows = piece.rows.filter((i) => owner[i] < 0);
       for (const i of rows) owner[i] = things.length;
       things.push({ rows, weight: rows.reduce((sum, i) => sum + weight[i], 0), votes: [piece] });
@@ -224,10 +224,27 @@ export function join(pieces, weight) {
   return united(things, together).filter(({ rows }) => rows.length > 1);
 }
 
-/** Unite the things that some piece covers together, and no photo shows apart. */
+/** Unite each thing with the heavier one that most pieces cover together with it and no photo shows apart from it. */
 function united(things, together) {
-  const photos = things.map(photosOf);
-  return grouped(things, together.filter(([a, b]) => ![...photos[a]].some((photo) => photos[b].has(photo))));
+  const photos = things.map(photosOf), best = new Map();
+  const counted = [...together].map(([pair, times]) => ({ pair: pair.split(" ").map(Number), times })).sort((a, b) => a.pair[0] - b.pair[0] || a.pair[1] - b.pair[1]);
+  for (const { pair, times } of counted) {
+    const [heavy, light] = pair.sort((a, b) => things[b].weight - things[a].weight || a - b);
+    if (![...photos[heavy]].some((photo) => photos[light].has(photo)) && times > (best.get(light)?.times ?? 0)) best.set(light, { times, heavy });
+  }
+  return grouped(things, [...best].map(([light, { heavy }]) => [light, heavy]));
+}
+
+/** Give each of count Gaussians to the thing of which most pieces show it, at least two; its founder counts twice. */
+export function grown(things, count) {
+  const owner = new Int32Array(count).fill(-1), most = new Int32Array(count).fill(1), own = things.map(() => []);
+  things.forEach(({ rows, votes }, t) => {
+    const times = new Map();
+    for (const shown of [rows, ...votes.map((piece) => piece.rows)]) for (const i of shown) times.set(i, (times.get(i) ?? 0) + 1);
+    for (const [i, count] of times) if (count > most[i]) (owner[i] = t), (most[i] = count);
+  });
+  owner.forEach((t, i) => t >= 0 && own[t].push(i));
+  return things.map((thing, t) => ({ ...thing, rows: own[t] })).filter(({ rows }) => rows.length > 1);
 }
 
 /** Unite slim things with what stands on or below them. boxes: the things' upright boxes. */
@@ -266,26 +283,16 @@ export function withoutCrumbs(things) {
   return things.filter((thing) => thing.weight >= CRUMB * typical || photosOf(thing).size >= OFTEN);
 }
 
-/** Find the upright box with the smallest base around weighted Gaussians: { center, axes, size }. */
-export function uprightBox(rows, centers, weight, up) {
-  const cross = (a, b) => [0, 1, 2].map((k) => a[(k + 1) % 3] * b[(k + 2) % 3] - a[(k + 2) % 3] * b[(k + 1) % 3]);
-  const least = up.reduce((best, value, k) => (Math.abs(value) < Math.abs(up[best]) ? k : best), 0);
-  const flat = cross(up, [0, 1, 2].map((k) => +(k === least))), aside = flat.map((value) => value / Math.hypot(...flat)), ahead = cross(up, aside);
+/** Find the box around weighted Gaussians along axes, of which the last is up: { center, axes, size }. */
+export function uprightBox(rows, centers, weight, axes) {
   const total = rows.reduce((sum, i) => sum + weight[i], 0), values = new Float64Array(rows.length), order = Uint32Array.from(rows.keys());
-  const ends = (axis) => {
+  const sides = axes.map((axis) => {
     rows.forEach((i, k) => (values[k] = centers[3 * i] * axis[0] + centers[3 * i + 1] * axis[1] + centers[3 * i + 2] * axis[2]));
     order.sort((a, b) => values[a] - values[b]);
     return [OUTLIERS, 1 - OUTLIERS].map((share) => quantile(share, rows, values, order, weight, total));
-  };
-  const height = ends(up);
-  let best = null;
-  for (let turn = 0; turn < TURNS; turn++) {
-    const angle = (turn * Math.PI) / 2 / TURNS, level = aside.map((value, k) => Math.cos(angle) * value + Math.sin(angle) * ahead[k]);
-    const axes = [level, cross(up, level), up], sides = [ends(axes[0]), ends(axes[1]), height], size = sides.map(([low, high]) => high - low);
-    if (best && !(size[0] * size[1] < best.size[0] * best.size[1])) continue;
-    best = { axes, size, center: [0, 1, 2].map((k) => sides.reduce((sum, [low, high], a) => sum + ((low + high) / 2) * axes[a][k], 0)) };
-  }
-  return best;
+  });
+  const center = [0, 1, 2].map((k) => sides.reduce((sum, [low, high], a) => sum + ((low + high) / 2) * axes[a][k], 0));
+  return { axes, size: sides.map(([low, high]) => high - low), center };
 }
 
 /** Interpolate a weighted quantile, as numpy's interp does between the middles of the weights. */

@@ -149,7 +149,7 @@ const jobs = {
   /** Find the single things of an answer: { things, candidates }. */
   things({ relevancy }) {
     if (!isPresent(relevancy, about.words.rules)) return { things: [], candidates: [] };
-    const found = thingsOf(views, { ...geometry, mass, gap: about.words.gap, up: about.up }, relevancy);
+    const found = thingsOf(views, { ...geometry, mass, gap: about.words.gap, edges: about.edges }, relevancy);
     const placed = (thing) => ({ ...thing, center: thing.center.map((value, axis) => value + about.center[axis]) });
     return { things: found.things.map((thing) => placed({ ...thing, id: known.id(thing) })), candidates: found.candidates.map(placed) };
   },

@@ -22,12 +22,13 @@ from lang3dxl_ns.common.files import make_folder, replace_file
 from lang3dxl_ns.common.pictures import PHOTO_SUFFIXES
 from lang3dxl_ns.files.scene_file import Provenance
 from lang3dxl_ns.query import view_ranking
+from lang3dxl_ns.query.ask import prompts_of
 from lang3dxl_ns.query.doubt import BEST, DOUBTFUL, DOUBTFUL_TAUGHT, LEAST_PEAK
 from lang3dxl_ns.query.heat_maps import PROMPT_COLORS
 from lang3dxl_ns.query.language import TABLE, phrases_of
 from lang3dxl_ns.query.negatives import CLEAR, NOTHING, competitors
-from lang3dxl_ns.query.scene import NO_SEMANTICS, Scene
-from lang3dxl_ns.query.text import Prompt, tidy
+from lang3dxl_ns.query.scene import Scene
+from lang3dxl_ns.query.text import NO_SEMANTICS, Prompt, tidy
 from lang3dxl_ns.query.thresholds import EVEN, SHARE
 from lang3dxl_ns.query.trust import ALIKE, ANCHORS, CLEARLY, FAINT, FAR, STRICTER, STRICTEST
 from lang3dxl_ns.query.visibility import spread
@@ -62,8 +63,8 @@ _SUGGESTED = (
 _NUMBERS = (
     ("ranking", view_ranking, "PEAK LARGE RIM STRONG CORE JOINED OUTLIERS DENSE"),
     ("things", pieces, "LEVELS PART DEPTH FILLED"),
-    ("things", join, "SHARED SPLINTER VIEWS CRUMB OFTEN MOST_SHARED SLIM STRAIGHT"),
-    ("things", thing, "OUTLIERS TURNS"),
+    ("things", join, "SHARED SPLINTER VIEWS CRUMB OFTEN SLIM STRAIGHT"),
+    ("things", thing, "OUTLIERS"),
     ("things", find, "COLORED SAME"),
     ("things", grammar, "BESIDE INSIDE CLOSE"),
 )
@@ -113,8 +114,8 @@ class Page:
             self.levels = levels_of(self.scene, min(self.large, MOST_ROWS))
             self.scene = self.levels.scenes[0]
         scene, within = self.scene, self.scene.config.foreground
-        self.prompts = scene.prompts(list(self.texts)) if self.texts else []
-        self._foreground = scene.prompts(within) if within else []
+        self.prompts = prompts_of(scene, list(self.texts)) if self.texts else []
+        self._foreground = prompts_of(scene, within) if within else []
         self._looks = list(scene.looks.names) if scene.looks else []
         self._toward = scene.overview.camera.position.to(scene.device)
         self._meaning: pack.PackedMeaning | None = None
@@ -141,6 +142,7 @@ class Page:
             "antialiased": scene.splats.antialiased,
             "background": [0, 0, 0] if scene.background is None else scene.background.tolist(),
             "up": find.up_of(scene).tolist(),
+            "edges": find.axes_of(scene).tolist(),
             "tour": told.tour,
             "meters": None if scene.file.georeference is None else asdict(scene.file.georeference),
             "start": pack.camera_json(scene.overview.full_camera),
@@ -275,7 +277,7 @@ class Page:
 
     def _meant(self, meaning: pack.PackedMeaning, word: str) -> tuple[Float[Tensor, "s r"], list[int]]:
         """Return the vectors searched for along with a word, and the negatives that it competes with."""
-        queries = self.scene.queries(self.scene.prompts([Prompt(word)]))
+        queries = self.scene.queries(prompts_of(self.scene, [Prompt(word)]))
         return meaning.of_texts(queries.vectors[list(queries.positive[0])]).cpu(), list(queries.negative[0])
 
     def _encoded(self, meaning: pack.PackedMeaning, texts: list[str]) -> Iterator[Float[Tensor, "m r"]]:
@@ -362,6 +364,7 @@ def write_page(page: Page, folder: Path) -> int:
     ours = index.is_file() and "<title>A scene to ask</title>" in index.read_text(errors="replace")
     names, other = {*own, "scene.json", "vocabulary.json"}, (".bin", *PHOTO_SUFFIXES)
     here = sorted(folder.iterdir())
+    names = {*own, "scene.json", "vocabulary.json"}
     taken = [path.name for path in here if path.name in names or path.suffix.lower() in other]
     if taken and not ours:  # whoever serves a folder of photos would publish them
         raise UserError(f"{folder} holds {taken[0]}, which is not a scene's page: name a folder of its own")

@@ -14,6 +14,7 @@ from torch import Tensor
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.query.answer import check_views
 from lang3dxl_ns.query.answering import Answering
+from lang3dxl_ns.query.ask import ask
 from lang3dxl_ns.query.text import taught_prompt
 from lang3dxl_ns.scene.record import same_clip
 from lang3dxl_ns.words.learn_word import Weights, learn
@@ -59,7 +60,7 @@ def least_certain_photo(scene: Answering, word: str) -> str:
     if taught is None:
         raise UserError(f"{word!r} was not taught: see lang3dxl words")
     check_views(scene)
-    chance = scene.ask(taught.name).relevancy[0]
+    chance = ask(scene, taught.name).relevancy[0]
     marked = {scene.file.photo(example.photo).name for example in taught.examples}
     views = {name: view for name, view in scene.visible.items() if name not in marked} or scene.visible
     open_question = chance * (1 - chance)

@@ -1,6 +1,7 @@
 """Loading a scene from a run's folder alone."""
 
 import shutil
+from dataclasses import replace
 from math import isqrt
 from pathlib import Path
 from types import SimpleNamespace
@@ -18,9 +19,11 @@ import lang3dxl_ns
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.evaluation.scores import open_scorer
 from lang3dxl_ns.files.scene_file import describe_scene_file, keep_words, read_scene
+from lang3dxl_ns.query.answer import relevancy_maps
 from lang3dxl_ns.query.relevancy import TEMPERATURE
 from lang3dxl_ns.rendering import Gaussians, rasterize, spherical_harmonics
 from lang3dxl_ns.scene.record import SCENE_FILE, SceneRecord
+from lang3dxl_ns.training.snapshot import snapshot
 from lang3dxl_ns.words.taught_words import Example
 
 WHOLE_SKY = {"pipeline__model__sky_gaussians": 2_000}
@@ -146,8 +149,9 @@ def test_the_files_frame_leads_back_to_colmaps(scene, trainer):
 def test_a_query_is_what_evaluation_scores(scene, trainer, tiny_clip):
     """The same words, vectors and formula as ns-eval's average precision, at the size of training."""
     scorer = open_scorer(SimpleNamespace(categories=["dome", "door"]), str(tiny_clip), "cpu")
-    model, camera = trainer.pipeline.model, scene.camera("photo_003.jpg", size=scene.trained_side)
-    maps = model.scene(scene.file).relevancy_maps(camera, scorer.queries)
+    side = min(max(photo.camera.width, photo.camera.height) for photo in scene.photos)
+    model, camera = trainer.pipeline.model, scene.camera("photo_003.jpg", size=side)
+    maps = relevancy_maps(snapshot(model.run, scene.file), camera, scorer.queries)
     for match, expected in zip(scene.query("dome; door", camera), maps, strict=True):
         seen = match.view.alpha >= scene.config.min_alpha
         np.testing.assert_allclose(match.relevancy[seen], expected.numpy()[seen], rtol=1e-5, atol=1e-6)
@@ -162,7 +166,7 @@ def test_a_folder_that_moved_can_be_asked(trainer, tmp_path):
 
 def test_a_model_in_training_can_be_asked(trainer):
     model = trainer.pipeline.model.eval()
-    scene = model.scene(SceneRecord.read(trainer.base_dir / SCENE_FILE))
+    scene = snapshot(model.run, SceneRecord.read(trainer.base_dir / SCENE_FILE))
     before = scene.query("dome", "photo_000").relevancy
     assert np.isfinite(before).all()
     means = model.means.detach().clone()
@@ -188,13 +192,13 @@ def test_mistakes_are_reported(config, tmp_path):
 def test_a_run_without_semantics_is_refused(trainer):
     file = SceneRecord.read(trainer.base_dir / SCENE_FILE)
     with pytest.raises(UserError, match="colors alone"):
-        trainer.pipeline.model.scene(SceneRecord(**{**vars(file), "clip": None})).query("dome")
+        snapshot(trainer.pipeline.model.run, replace(file, clip=None)).query("dome")
 
 
 def test_another_clip_is_refused(trainer):
     file = SceneRecord.read(trainer.base_dir / SCENE_FILE)
     with pytest.raises(UserError, match="not the one that this scene was made with"):
-        trainer.pipeline.model.scene(SceneRecord(**{**vars(file), "clip_identity": "another"})).query("dome")
+        snapshot(trainer.pipeline.model.run, replace(file, clip_identity="another")).query("dome")
 
 
 def test_a_run_remembers_its_foreground_masks(trainer, scene):

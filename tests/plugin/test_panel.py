@@ -16,13 +16,13 @@ from nerfstudio.utils.eval_utils import eval_setup
 from nerfstudio.viewer.viewer import Viewer
 from scenes import view_of, write_scene
 
-from lang3dxl_ns.plugin import conversation as session
 from lang3dxl_ns.plugin.panel import INVITATION, stand_of
 from lang3dxl_ns.plugin.pipeline import QUERY_VARIABLE
 from lang3dxl_ns.query.question import QueryConfig
 from lang3dxl_ns.scene.record import overview
 from lang3dxl_ns.things.find import Things
 from lang3dxl_ns.things.thing import Sighting, Thing
+from lang3dxl_ns.training import conversation as session
 
 
 @pytest.fixture(scope="module")

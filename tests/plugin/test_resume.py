@@ -10,10 +10,10 @@ from conftest import make_trainer
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.open_scene import load_scene
-from lang3dxl_ns.plugin.pipeline import Lang3DXLPipeline
 from lang3dxl_ns.plugin.trainer import Lang3DXLTrainer
 from lang3dxl_ns.scene.record import SCENE_FILE, SceneRecord
-from lang3dxl_ns.training import batches
+from lang3dxl_ns.training import batches, learn_codes
+from lang3dxl_ns.training.state import Training
 
 EVERYTHING = {
     "pipeline__model__decoder__name": "paper",
@@ -126,11 +126,11 @@ FROM_PHOTOS = EVERYTHING | {"pipeline__model__codes_from": "photos", "pipeline__
 
 @pytest.fixture(scope="module")
 def starts():
-    """The pipelines that started codes from photos, in their order."""
-    found: list[Lang3DXLPipeline] = []
-    learn = Lang3DXLPipeline.learn_words
+    """The runs that started codes from photos, in their order."""
+    found: list[Training] = []
+    learn = learn_codes.learn_words
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Lang3DXLPipeline, "learn_words", lambda self: found.append(self) or learn(self))
+        patch.setattr(learn_codes, "learn_words", lambda run, data: found.append(run) or learn(run, data))
         yield found
 
 
@@ -142,7 +142,7 @@ def whole_from_photos(starts, scene, tiny_clip, tiny_dense, tmp_path_factory):
     trainer = make_trainer(scene, tiny_clip, tiny_dense, folder, 20, **changes)
     trainer.setup()
     trainer.train()
-    assert starts == [trainer.pipeline]
+    assert starts == [trainer.pipeline.model.run]
     return trainer
 
 
@@ -160,7 +160,7 @@ def test_codes_start_from_photos_once_also_if_the_run_is_interrupted(
 def test_codes_that_were_trained_do_not_start_again_in_a_longer_run(train, scene, monkeypatch):
     settings = FROM_PHOTOS | {"pipeline__model__densify_until": 0.0}
     first = train(scene, iterations=6, **settings)
-    monkeypatch.setattr(Lang3DXLPipeline, "learn_words", lambda self: pytest.fail("started again"))
+    monkeypatch.setattr(learn_codes, "learn_words", lambda *_: pytest.fail("started again"))
     train(scene, iterations=20, load_dir=first.checkpoint_dir, **settings)
 
 

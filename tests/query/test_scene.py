@@ -22,6 +22,7 @@ from painted_scene import (
 from PIL import Image
 
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.query.ask import prompts_of
 from lang3dxl_ns.query.match import together
 from lang3dxl_ns.query.question import QueryConfig
 from lang3dxl_ns.query.scene import Scene
@@ -400,4 +401,4 @@ def test_the_cache_is_forgotten_with_the_masks_and_the_way_of_drawing(tmp_path, 
 def test_an_array_of_texts_is_a_list_of_them():
     scene = painted_scene()
     for texts in (np.array(["dome", "windows"]), np.array(["dome", "windows"], object)):
-        assert [p.text for p in scene.prompts(texts)] == ["dome", "windows"]
+        assert [p.text for p in prompts_of(scene, texts)] == ["dome", "windows"]

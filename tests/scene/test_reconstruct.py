@@ -17,6 +17,7 @@ from lang3dxl_ns.scene.photo_folder import find_photos
 from lang3dxl_ns.scene.placements import cameras_of, doubtful_placements, matched_pairs, rotations_of
 from lang3dxl_ns.scene.reconstruct import reconstruct, reconstruct_scene
 from lang3dxl_ns.scene.reconstruction import ReconstructionSettings
+from lang3dxl_ns.scene.symmetry import contradictions
 
 SIFT = ReconstructionSettings(features="sift")  # also where XFeat is installed
 
@@ -84,14 +85,19 @@ def test_what_matches_measure_agrees_with_the_model(reconstructed):
     }
 
 
-def test_a_model_that_many_photos_contradict_is_mapped_anew(photos, monkeypatch, capsys):
-    """Nothing really contradicts here, so all photos keep a pose."""
-    doubts = iter([{1: "it looks away"}, {}])
-    monkeypatch.setattr(module, "_doubts", lambda database, model: next(doubts))
+def test_contradicting_pairs_are_left_out_of_a_second_model(photos, monkeypatch, capsys):
+    """The pair is honest here, so all photos keep a pose by others. The database keeps it."""
+    monkeypatch.setattr(module, "contradictions", lambda database, known: {(1, 7)})
     report = reconstruct(find_photos(photos), photos / "work", photos / "sparse", SIFT)
-    assert "mapping anew" in capsys.readouterr().out
-    assert report.registered == 7
+    assert "mapping anew without them" in capsys.readouterr().out
+    assert (report.registered, report.contradicting) == (7, 1)
     assert not list((photos / "work").glob("tmp*"))
+
+
+def test_honest_photos_have_no_contradictions(reconstructed):
+    data, model, _ = reconstructed
+    database = data / "lang3dxl_cache/reconstruction/database.db"
+    assert contradictions(database, cameras_of(pycolmap.Reconstruction(model))) == set()
 
 
 def test_a_picture_shows_the_cameras_and_is_no_photo(reconstructed):

@@ -1,11 +1,13 @@
 """Symmetry: pairs between like-looking sides are left out, honest ones stay."""
 
-import numpy as np
+import numpy as np  # before pycolmap
+import pycolmap
 import pytest
 from scipy.spatial.transform import Rotation
 
+from lang3dxl_ns.scene import symmetry
 from lang3dxl_ns.scene.placements import MatchedPair
-from lang3dxl_ns.scene.symmetry import contradicting_pairs
+from lang3dxl_ns.scene.symmetry import contradicting_pairs, contradictions, copy_without
 
 
 def turned(degrees, rng):
@@ -64,3 +66,25 @@ def test_numbers_and_direction_of_a_pair_do_not_matter(walk):
     found = {(40 - j, 40 - i) for i, j in contradicting_pairs(swapped)}
     assert found == contradicting_pairs(pairs + false)
     assert found == {(p.first, p.second) for p in false}
+
+
+def test_few_contradicting_matches_make_no_symmetry(walk, monkeypatch, tmp_path):
+    """Matches of chance contradict in honest collections too, and mapping them twice would tell nothing."""
+    pairs, rng = walk
+    pycolmap.Database.open(tmp_path / "database.db").close()
+    for matches, symmetric in ((15, False), (45, True)):
+        measured = pairs + false_pairs(range(4), range(9, 13), matches, rng)
+        monkeypatch.setattr(symmetry, "matched_pairs", lambda *_, measured=measured: measured)
+        assert bool(contradictions(tmp_path / "database.db", {})) == symmetric
+
+
+def test_only_the_copy_lacks_the_pairs(tmp_path):
+    database, copy = tmp_path / "database.db", tmp_path / "copy.db"
+    with pycolmap.Database.open(database) as db:
+        for pair in ((1, 2), (1, 3)):
+            db.write_two_view_geometry(*pair, pycolmap.TwoViewGeometry(inlier_matches=np.zeros((20, 2), int)))
+    copy_without({(1, 3)}, database, copy)
+    for path, kept in ((database, 2), (copy, 1)):
+        with pycolmap.Database.open(path) as db:
+            assert len(db.read_two_view_geometry_num_inliers()[0]) == kept
+            assert db.exists_two_view_geometry(1, 2)

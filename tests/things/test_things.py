@@ -2,20 +2,23 @@
 
 import csv
 import json
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 from painted_scene import painted_file, painted_scene
 
 from lab.benchmarks.questions import Known, ask_all
 from lab.landmark.instances import true_things
 from lab.landmark.landmark import Landmark
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.query.trust import FAR
 from lang3dxl_ns.scene.georeference import Georeference
-from lang3dxl_ns.things.find import Things, up_of
+from lang3dxl_ns.things.find import Things, axes_of, up_of
 from lang3dxl_ns.things.grammar import Request, Sight, answer, parse, sight_of, table, unsure
-from lang3dxl_ns.things.join import OFTEN, Joined, join, stacked, without_crumbs
+from lang3dxl_ns.things.join import OFTEN, Joined, grown, join, stacked, without_crumbs
 from lang3dxl_ns.things.pieces import Piece, Shown, pieces_of, split
 from lang3dxl_ns.things.thing import Thing, upright_box
 from lang3dxl_ns.things.write import write_catalog
@@ -72,6 +75,30 @@ def test_sides_that_no_photo_shows_apart_are_one_thing():
     assert sorted(one.rows.tolist()) == list(range(6))
 
 
+def test_crumbs_between_two_towers_do_not_make_one_of_them():
+    left, right, crumb = range(10), range(10, 20), [20, 21]
+    alone = [piece(*one) for one in (("a", left, 9.0), ("b", right, 8.0), ("c", crumb, 7.0))]
+    both = [
+        piece("d", [*left, *crumb], 2.0),
+        piece("e", [*left, *crumb], 2.0),
+        piece("f", [*right, *crumb], 2.0),
+    ]
+    found = join([*alone, *both], np.ones(22))
+    assert sorted(sorted(one.rows.tolist()) for one in found) == [[*left, *crumb], [*right]]
+
+
+def test_a_thing_gets_the_gaussians_that_most_of_its_pieces_show():
+    shown = [
+        piece("a", [0, 1, 2], 9.0),
+        *(piece(p, [1, 2, 3], 5.0) for p in "bcd"),
+        piece("e", [1, 2, 4], 5.0),
+    ]
+    beside = [piece("a", [5, 6, 7], 9.0), piece("b", [3, 5, 6, 7], 5.0)]
+    found = grown(join([*shown, *beside], np.ones(9)), 9)
+    assert [sorted(one.rows.tolist()) for one in found] == [[0, 1, 2, 3], [5, 6, 7]]
+    assert grown([], 9) == []
+
+
 def test_crumbs_go_and_equals_stay():
     sizes = [np.arange(100), np.arange(100, 200), np.arange(200, 202)]
     found = without_crumbs(join([piece("a", rows, 1.0) for rows in sizes], np.ones(202)))
@@ -88,16 +115,36 @@ def test_many_views_tell_that_a_small_thing_is_no_crumb():
     assert 100 in found[1].rows
 
 
-def test_a_box_turns_with_its_points():
+@pytest.mark.parametrize("angle", [0.0, 0.3, 1.1, 2.0])
+def test_boxes_stand_along_the_walls(angle):
     rng = np.random.default_rng(0)
-    points = rng.uniform(-0.5, 0.5, (4000, 3)) * (4, 1, 2)
-    for angle in (0.0, 0.3, 1.1, 2.0):
-        c, s = np.cos(angle), np.sin(angle)
-        turned = points @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]) + (5, 6, 7)
-        center, axes, size = upright_box(turned, np.ones(4000), np.array([0, 0, 1.0]))
-        assert center == pytest.approx([5, 6, 7], abs=0.1)
-        assert np.sort(size) == pytest.approx([0.94, 1.88, 3.76], abs=0.25)
-        assert axes @ axes.T == pytest.approx(np.eye(3), abs=1e-9)
+    scene = painted_scene()
+    up = up_of(scene)
+    aside = np.cross(up, np.roll(up, 1))
+    aside /= np.linalg.norm(aside)
+    along = np.cos(angle) * aside + np.sin(angle) * np.cross(up, aside)
+    walls = np.stack([along, np.cross(up, along), up])
+    # Two walls at a corner, as thick as a tenth of their length.
+    flat = rng.uniform(0, 1, (2, 2000, 3)) * [[[10, 1, 9]], [[1, 10, 9]]] + rng.normal(
+        scale=0.1, size=(2, 2000, 3)
+    )
+    points = flat.reshape(-1, 3) @ walls + (5, 6, 7)
+
+    @dataclass
+    class Walls:
+        file = scene.file
+        photos = scene.photos
+        splats = SimpleNamespace(means=torch.tensor(points))
+        mass = torch.arange(len(points))
+        gap = 0.5
+
+    axes = axes_of(Walls())
+    assert axes @ axes.T == pytest.approx(np.eye(3), abs=1e-9)
+    assert axes[2] == pytest.approx(up)
+    assert abs(axes[:2] @ along).max() == pytest.approx(1, abs=2e-3)
+    center, _, size = upright_box(flat[0] @ walls, np.ones(2000), walls)
+    assert center == pytest.approx(walls.T @ (5, 0.5, 4.5), abs=0.2)
+    assert size == pytest.approx([9.4, 0.94, 8.5], abs=0.3)
 
 
 @pytest.mark.parametrize(
@@ -292,3 +339,16 @@ def test_slim_things_are_one_with_what_stands_on_them_and_windows_in_tiers_are_n
     assert joined([shaft, tip, (9, 7, (1, 1, 2)), far]) == [[0, 1], [2], [3]]
     assert joined([(0, 0, (1, 0.2, 2)), (0, 3, (1, 0.2, 2))]) == [[0], [1]]
     assert joined([]) == []
+
+
+def test_counts_are_doubtful_where_the_answer_or_the_scene_is():
+    scene = painted_scene()
+
+    def caution(foreignness: float, text: str = "windows") -> str | None:
+        strange = replace(scene)
+        strange.__dict__.update(foreignness=foreignness)
+        return strange.things(text)[0].caution
+
+    assert caution(1.0) is None
+    assert "as far from what its CLIP was trained on" in caution(FAR)
+    assert caution(1.0, "nothing of the kind") is not None

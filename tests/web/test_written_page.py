@@ -17,7 +17,7 @@ from painted_scene import (
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import read_names
-from lang3dxl_ns.query.scene import NO_SEMANTICS
+from lang3dxl_ns.query.text import NO_SEMANTICS
 from lang3dxl_ns.query.vocabulary import common_words, shipped_vocabulary, whole_words
 from lang3dxl_ns.web.photos import extent
 from lang3dxl_ns.web.write_page import _DATA, Page, write_page

@@ -14,10 +14,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from lang3dxl_ns.query.answer import locate
 from lang3dxl_ns.query.match import Found
 from lang3dxl_ns.query.question import QueryConfig, Question, pictures
-from lang3dxl_ns.query.scene import Scene, text_encoder
-from lang3dxl_ns.query.text import EncodeTexts, caution
+from lang3dxl_ns.query.scene import Scene
+from lang3dxl_ns.query.text import EncodeTexts, caution, text_encoder
 from lang3dxl_ns.rendering import Rendering
 from lang3dxl_ns.scene.record import SceneRecord
 from lang3dxl_ns.things.find import Things, things_of
@@ -89,7 +90,7 @@ class Conversation:
         """Find matches of each prompt in the scene. The first search examines the scene, which takes long."""
         assert self._asked is not None
         scene, question = self._asked
-        found = scene.places(question)
+        found = locate(scene, question)
         if question is self.question:
             self.found = found
         return found

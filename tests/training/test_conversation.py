@@ -7,8 +7,8 @@ import pytest
 import torch
 from painted_scene import encode_texts, painted_codes, painted_scene, painted_splats
 
-from lang3dxl_ns.plugin import conversation as module
-from lang3dxl_ns.plugin.conversation import Conversation
+from lang3dxl_ns.training import conversation as module
+from lang3dxl_ns.training.conversation import Conversation
 
 
 @pytest.fixture
