@@ -59,7 +59,7 @@ export class Answers {
   /** Judge an answer by one word and its reason, as Python's query/trust.py does. */
   trust({ doubt, isDoubtful, fit, taught, alike }) {
     const { rules, foreign } = this.words, far = foreign !== null && foreign >= rules.far;
-    const best = `the best places fit at ${fit.toFixed(2)}`, told = (level, reason) => ({ level, reason, far, alike });
+    const best = `the best places fit at ${fit.toFixed(2)}`, told = (level, reason) => ({ level, reason, far: far && !taught, alike });
     const world = far ? `; this scene is ${foreign.toFixed(1)} times as far from what its CLIP was trained on as usual` : "";
     if (isDoubtful && taught) return told("doubtful", `${Math.round(100 * doubt)} % of what was not marked fits as well`);
     if (doubt === 1) return told("doubtful", "it fits no place: it may not be here, or this scene's CLIP may not know the word");

@@ -150,7 +150,7 @@ export class List extends EventTarget {
     const things = Object.fromEntries(Object.entries(found).map(([word, one]) => [word, one.things]));
     const view = this.directions, chosen = answerTo(request, things, view), [first] = asked, every = chosen.length === things[request.word].length;
     Object.assign(first, { listed: true, asked: every ? null : new Set(chosen.map(({ id }) => id)) });
-    const sure = asked.every(({ trust }) => trust.level === "sure") ? "" : " Not sure: see the cards.";
+    const sure = asked.every(({ trust }) => trust.level === "sure" && !trust.far) ? "" : " Not sure: see the cards.";
     const doubt = request.count && every ? null : unsure(request, found, view, shown);
     const note = (doubt ? ` Unsure, since ${doubt}.` : "") + sure;
     if (request.count) {

@@ -6,6 +6,7 @@ from pages import DESK, browser, opened, served, until, until_linked
 from painted_scene import painted_scene
 
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.query.trust import FAR
 from lang3dxl_ns.things.find import Things
 from lang3dxl_ns.things.grammar import Sight, answer, parse, unsure
 from lang3dxl_ns.things.join import Joined, grown, join, stacked, without_crumbs
@@ -212,3 +213,13 @@ def test_questions_typed_into_the_page_are_answered_or_refused(page):
     assert "near" in page.evaluate(refused)
     page.evaluate("lang3dxl.clear()")
     until(page, "lang3dxl.view.only", None)
+
+
+def test_counts_in_a_strange_scene_have_a_caution(browser, tmp_path):
+    strange = painted_scene()
+    strange.__dict__.update(foreignness=FAR)
+    write_page(Page(strange), tmp_path)
+    with served(tmp_path) as address:
+        page = opened(browser, address, DESK)
+        told = page.evaluate("lang3dxl.ask('how many windows').then(({ told }) => told)")
+    assert told.startswith("2") and "Not sure" in told
