@@ -5,6 +5,7 @@ import json
 import re
 import subprocess
 import sys
+from functools import cache
 from itertools import chain
 from pathlib import Path
 
@@ -16,6 +17,18 @@ else:
     import tomli as tomllib  # a dependency of pytest there
 
 PACKAGE = Path(__file__).parent.parent / "lang3dxl_ns"
+
+
+@cache
+def nodes(source: str) -> list[ast.AST]:
+    """All nodes of a module's tree, which several laws look at."""
+    return list(ast.walk(ast.parse(source)))
+
+
+@pytest.fixture(scope="module", autouse=True)
+def forget_nodes():
+    yield
+    nodes.cache_clear()
 
 
 def run(code: str) -> str:
@@ -54,7 +67,7 @@ def faults(source: str, room: str) -> list[str]:
     """Imports of `source`, a module of `room`, that go up, or reach for nerfstudio where it has no place."""
     floor = {name: i for i, names in enumerate(ORDER) for name in names}
     found = []
-    for node in ast.walk(ast.parse(source)):
+    for node in nodes(source):
         if isinstance(node, ast.ImportFrom):
             names = [node.module or ""]
         elif isinstance(node, ast.Import):
@@ -98,7 +111,7 @@ NAMED = re.compile(r"(lab|commands)(\.\w+)+:\w+")
 
 def named_places(source: str) -> set[str]:
     """Modules that a source reaches by strings, such as "lab.numerics.command:Numerics"."""
-    texts = (n.value for n in ast.walk(ast.parse(source)) if isinstance(n, ast.Constant))
+    texts = (n.value for n in nodes(source) if isinstance(n, ast.Constant))
     return {text for text in texts if isinstance(text, str) and NAMED.fullmatch(text)}
 
 
@@ -130,7 +143,7 @@ STILL_ANY = {
 def typed_any(source: str) -> set[str]:
     """Names among `OWN` that are annotated Any."""
     found = set()
-    for node in ast.walk(ast.parse(source)):
+    for node in nodes(source):
         name = node.arg if isinstance(node, ast.arg) else None
         if isinstance(node, ast.AnnAssign):
             name = getattr(node.target, "id", getattr(node.target, "attr", None))
@@ -179,7 +192,7 @@ def test_what_is_imported_is_declared():
     }
     imported = set()
     for path in PACKAGE.rglob("*.py"):
-        for node in ast.walk(ast.parse(path.read_text())):
+        for node in nodes(path.read_text()):
             if isinstance(node, ast.ImportFrom) and node.module:
                 imported.add(node.module.split(".")[0])
             elif isinstance(node, ast.Import):
@@ -191,7 +204,7 @@ def test_what_is_imported_is_declared():
 def all_imports(source: str, modules) -> set[str]:
     """Modules of the package that a module imports anywhere: within functions and for type checkers too."""
     found = set()
-    for node in ast.walk(ast.parse(source)):
+    for node in nodes(source):
         if isinstance(node, ast.ImportFrom) and node.module:
             found |= {node.module} | {f"{node.module}.{alias.name}" for alias in node.names}
         elif isinstance(node, ast.Import):

@@ -1,9 +1,11 @@
 """The page of large scenes in Chromium: bytes and seconds to picture and answer, memory, and frames.
 
     python -m lab.benchmarks.large_pages RUN --sizes 18000 300000 1000000 3000000
+    python -m lab.benchmarks.large_pages DEMO/run --truth DEMO/scene/ground_truth
 
-Large scenes are copies of a trained one, side by side. WebGL runs in software here: a machine with a GPU
-draws frames many times faster.
+The second one tells what words lose by merging: the mean AP of each level in the held-out views. Large scenes
+are copies of a trained one, side by side. WebGL runs in software here: a machine with a GPU draws frames many
+times faster.
 """
 
 from __future__ import annotations
@@ -20,7 +22,11 @@ import torch
 
 from lab.benchmarks.chromium import Counting, chromium, served
 from lang3dxl_ns import load_scene
+from lang3dxl_ns.evaluation.aggregate import average
+from lang3dxl_ns.evaluation.ground_truth import GroundTruth
+from lang3dxl_ns.evaluation.score_scene import score_scene
 from lang3dxl_ns.query.scene import Scene
+from lang3dxl_ns.web.levels import levels_of
 from lang3dxl_ns.web.write_page import Page, write_page
 
 WINDOWS = {"phone": (390, 844), "desk": (1440, 900)}
@@ -96,13 +102,30 @@ def measured(browser: Any, folder: Path, window: tuple[int, int]) -> list[str]:
     return [*(f"{number:.2f}" for number in numbers), f"{held:,}", f"{frames:.1f}"]
 
 
+def print_words(scene: Scene, truth: GroundTruth) -> None:
+    """Print the mean AP of a scene, and of a quarter and a sixteenth as many merged Gaussians."""
+    print("| Gaussians | kB | mean AP | s to merge |\n|---|---|---|---|")
+    for level in range(3):
+        start = time.process_time()
+        merged = levels_of(scene, len(scene.splats) // 4**level + 64).scenes[0] if level else scene
+        seconds, count = time.process_time() - start, len(merged.splats)
+        files = Page(merged, large=count).files()
+        size = sum(len(files.get(name, b"")) for name in ("splats.bin", "codes.bin", "rows.bin"))
+        figures, _ = score_scene(merged, truth, "held-out")
+        words = average(list(figures.values()))["map"]
+        print(f"| {count:,} | {size / 1e3:.0f} | {words:.3f} | {seconds:.1f} |", flush=True)
+
+
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("run", type=Path)
     parser.add_argument("--sizes", type=int, nargs="+", default=[18_000, 300_000, 1_000_000, 3_000_000])
+    parser.add_argument("--truth", type=Path)
     options = parser.parse_args()
     scene = load_scene(options.run)
+    if options.truth is not None:
+        return print_words(scene, GroundTruth(options.truth))
     print("| Gaussians | window | MB, picture | s | MB, answer | s | MB, heap | held | frames a second |")
     print("|---" * 9 + "|")
     with chromium() as browser, tempfile.TemporaryDirectory() as kept:

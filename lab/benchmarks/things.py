@@ -1,26 +1,37 @@
-"""`lang3dxl benchmark things`: instances, counts and boxes against what the generator built."""
+"""`lang3dxl benchmark things`: instances, counts and boxes against what the generator built.
+
+Boxes are compared with the building's own, and, as `lang3dxl evaluate run` does, with those of the Gaussians
+that photos show on each true thing: what lies between the two is the depth of the trained geometry.
+"""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float, Int
 from numpy import ndarray as Array
 from scipy.optimize import linear_sum_assignment
 
 from lab.benchmarks.questions import Known, Outcome, ask_all, in_words
-from lab.landmark.instances import TrueThing, placed, seen_things
+from lab.landmark.instances import TrueThing, photos_of, pixels, placed, seen_things, true_things
 from lab.landmark.labels import CATEGORIES
+from lab.landmark.landmark import Landmark
 from lab.reports import command_line
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.files import read_json
 from lang3dxl_ns.common.reports import markdown_table, write_report
 from lang3dxl_ns.query.scene import Scene
-from lang3dxl_ns.things.find import Things
-from lang3dxl_ns.things.thing import Thing
+from lang3dxl_ns.rendering import composite
+from lang3dxl_ns.rendering.gathering import Pixels, gather
+from lang3dxl_ns.things.find import Things, axes_of
+from lang3dxl_ns.things.thing import Thing, upright_box
 
 NEAR = 0.6
 """A thing is found if a center is this close to its own, relative to its longest edge."""
@@ -53,10 +64,21 @@ class ThingsBenchmark:
             start = time.process_time()
             answers = scene.things(list(CATEGORIES))
             seconds[data.parent.name] = time.process_time() - start
-            rows += [score(answer, truth, data.parent.name) for answer in answers]
+            marks = marked_boxes(scene, data)
+            rows += [score(answer, truth, data.parent.name, marks) for answer in answers]
             asked += ask_all(scene, {one.word: known(one, truth) for one in answers})
         table = markdown_table(
-            ["word", "seen", "found", "false", "F1", "count off (median)", "in range", "box IoU"],
+            [
+                "word",
+                "seen",
+                "found",
+                "false",
+                "F1",
+                "count off (median)",
+                "in range",
+                "box IoU",
+                "of Gaussians",
+            ],
             [_summary(word, [row for row in rows if row.word == word]) for word in CATEGORIES],
         )
         times = ", ".join(f"{name} {t:.1f}" for name, t in seconds.items())
@@ -87,7 +109,9 @@ class Score:
     count: tuple[int, int, int]
     """Count, and the range that it is said to lie in."""
     ious: tuple[float, ...]
-    """Of the boxes of the things found."""
+    """Of the boxes of the things found, against the building's."""
+    marked_ious: tuple[float, ...] = ()
+    """The same, against boxes of the Gaussians that photos show on the true things."""
 
     @property
     def f1(self) -> float:
@@ -107,8 +131,39 @@ def true_things_of(scene: Scene, data: Path) -> list[TrueThing]:
     return [placed(thing, *frame, thing.pixels) for thing in seen_things(data)]
 
 
-def score(answer: Things, truth: Sequence[TrueThing], scene: str = "") -> Score:
-    """Compare the answer to one word with the true things of that word, each matched once."""
+def marked_boxes(scene: Scene, data: Path) -> list[Thing | None]:
+    """Return the box of each true thing's Gaussians: those of whose pixels in the training photos more than
+    half show it. None for a thing with fewer than two."""
+    about = read_json(data / "scene.json")
+    landmark = Landmark.from_seed(about["seed"], about["family"])
+    things, numbers = true_things(landmark)
+
+    def probes():
+        for name, camera, _ in photos_of(about):
+            if name in scene.visible:
+                own = scene.file.photo(name).camera
+                shown = torch.from_numpy(pixels(landmark, numbers, camera, (own.width, own.height)))
+                labels = F.one_hot(shown + 1, len(things) + 1)[:, :, 1:].float()
+                yield partial(composite, scene.splats, own), Pixels.of([labels], shown.shape)
+
+    shares, mass = gather(len(scene.splats), probes(), len(things), scene.splats.means)
+    means, axes = scene.splats.means.double().cpu().numpy(), axes_of(scene)
+    marked = [np.flatnonzero(share > 0.5) for share in shares.T.cpu().numpy()]
+    weight = mass.double().cpu().numpy()
+    return [_boxed(rows, means, weight, axes) if len(rows) > 1 else None for rows in marked]
+
+
+def _boxed(
+    rows: Int[Array, " m"], means: Float[Array, "n 3"], mass: Float[Array, " n"], axes: Float[Array, "3 3"]
+) -> Thing:
+    return Thing(0, "", 1.0, 0, *upright_box(means[rows], mass[rows], axes), rows)
+
+
+def score(
+    answer: Things, truth: Sequence[TrueThing], scene: str = "", marks: Sequence[Thing | None] = ()
+) -> Score:
+    """Compare the answer to one word with the true things of that word, each matched once. `marks` are the
+    `marked_boxes` of the true things."""
     own = [thing for thing in truth if thing.word == answer.word]
     seen, hidden = ([t for t in own if t.seen is shown] for shown in (True, False))
     pairs = matched(answer.things, seen)
@@ -116,7 +171,10 @@ def score(answer: Things, truth: Sequence[TrueThing], scene: str = "") -> Score:
     false = len(free) - len(matched(free, hidden))
     ious = tuple(box_iou(answer.things[a], seen[b]) for a, b in pairs)
     count = len(answer.things), answer.least, answer.most
-    return Score(scene, answer.word, len(seen), len(pairs), false, count, ious)
+    boxes = dict(zip(truth, marks, strict=False))
+    marked = ((answer.things[a], boxes.get(seen[b])) for a, b in pairs)
+    marked_ious = tuple(box_iou(found, box) for found, box in marked if box is not None)
+    return Score(scene, answer.word, len(seen), len(pairs), false, count, ious, marked_ious)
 
 
 def known(answer: Things, truth: Sequence[TrueThing]) -> Known:
@@ -156,9 +214,9 @@ def box_iou(a: Thing | TrueThing, b: Thing | TrueThing) -> float:
 def _summary(word: str, rows: Sequence[Score]) -> list[str]:
     there, false = [row for row in rows if row.seen], sum(row.false for row in rows)
     if not there:
-        return [word, "0", "", str(false), "", "", "", ""]
-    ious = [iou for row in there for iou in row.ious]
+        return [word, "0", "", str(false), *[""] * 5]
+    ious, marked = ([iou for row in there for iou in getattr(row, name)] for name in ("ious", "marked_ious"))
     in_range = np.mean([row.count[1] <= row.seen <= row.count[2] for row in there])
     return [word, str(sum(row.seen for row in there)), str(sum(row.found for row in there)), str(false),
             f"{np.mean([row.f1 for row in there]):.2f}", f"{np.median([row.off for row in there]):.0%}",
-            f"{in_range:.0%}", f"{np.mean(ious):.2f}" if ious else ""]  # fmt: skip
+            f"{in_range:.0%}", *(f"{np.mean(iou):.2f}" if iou else "" for iou in (ious, marked))]  # fmt: skip

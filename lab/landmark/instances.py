@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -126,6 +127,18 @@ def pixels(
     return things
 
 
+def photos_of(about: dict[str, Any]) -> Iterator[tuple[str, Camera, tuple[int, int]]]:
+    """Yield name, camera and size of each training photo of the demo scene that scene.json tells `about`."""
+    from lab.landmark.scene_writer import photo_view
+
+    landmark = Landmark.from_seed(about["seed"], about["family"])
+    for number in range(1, about["photos"] + 1):
+        name = f"{number:04d}.jpg"
+        if name not in about["held_out"]:
+            view, *size = photo_view(landmark, about["seed"], number, about["wild"], (480, 360))
+            yield name, view.camera, (size[0], size[1])
+
+
 def seen_things(data: Path, coarse: int = 2) -> list[TrueThing]:
     """List the true things of a demo scene in COLMAP's frame, with which ones its training photos show.
 
@@ -133,17 +146,12 @@ def seen_things(data: Path, coarse: int = 2) -> list[TrueThing]:
         data: folder of a demo scene, which holds scene.json.
         coarse: photos are cast at 1/coarse of their size.
     """
-    from lab.landmark.scene_writer import photo_view
-
     about = read_json(data / "scene.json")
     landmark = Landmark.from_seed(about["seed"], about["family"])
     things, numbers = true_things(landmark)
     shown = np.zeros((len(things), 2), int)
-    for number in range(1, about["photos"] + 1):
-        if f"{number:04d}.jpg" in about["held_out"]:
-            continue
-        view, width, height = photo_view(landmark, about["seed"], number, about["wild"], (480, 360))
-        flat = pixels(landmark, numbers, view.camera, (width // coarse, height // coarse)).ravel()
+    for _, camera, (width, height) in photos_of(about):
+        flat = pixels(landmark, numbers, camera, (width // coarse, height // coarse)).ravel()
         counts = np.bincount(flat[flat >= 0], minlength=len(things)) * coarse**2
         shown = np.sort(np.column_stack([shown, counts]), axis=1)[:, 1:]
     frame = about["colmap_from_meters"]

@@ -13,9 +13,11 @@ from numpy import ndarray as Array
 from torch import Tensor
 
 from lang3dxl_ns.query.answering import Answering
-from lang3dxl_ns.query.doubt import doubtful, peaks
+from lang3dxl_ns.query.doubt import peaks
 from lang3dxl_ns.query.question import Question
+from lang3dxl_ns.query.trust import FAR
 from lang3dxl_ns.rendering import composite
+from lang3dxl_ns.scene.camera import seen_from
 from lang3dxl_ns.things.join import VIEWS, Joined, grown, join, stacked, without_crumbs
 from lang3dxl_ns.things.pieces import FILLED, LEVELS, Piece, Shown, pieces_of
 from lang3dxl_ns.things.thing import Box, Sighting, Thing, upright_box
@@ -42,7 +44,7 @@ class Things:
     candidates: list[Thing] = field(default_factory=list)
     """Further things, perhaps: those that a single photo shows, and small ones."""
     caution: str | None = None
-    """Why the answer is doubtful; None if it isn't."""
+    """Why the answer is doubtful, or counts are; None if neither is."""
 
     @property
     def sure(self) -> list[Thing]:
@@ -99,7 +101,8 @@ def things_of(scene: Answering, question: Question) -> list[Things]:
                   for one in [*sure, *(one for one in joined if one not in sure)]]  # fmt: skip
         things, candidates = listed[: len(sure)], listed[len(sure) :]
         known += [thing for thing in things if all(thing.id != other.id for other in known)]
-        caution = doubtful(prompt.text, question.doubts[i], prompt.taught is not None)
+        trust, far = question.trusts[i], (scene.foreignness or 0) >= FAR and prompt.taught is None
+        caution = trust.reason if far or trust.level != "sure" else None
         answers.append(Things(prompt.text, things, candidates, caution))
     return answers
 
@@ -158,8 +161,7 @@ def _views(scene: Answering, heat: Float[Tensor, "n q"]) -> Iterator[list[Shown]
     for name, view in scene.visible.items():
         photo = scene.file.photo(name)
         camera = photo.camera
-        pose = camera.view_matrix.to(means)
-        seen = means @ pose[:3, :3].T + pose[:3, 3]
+        seen = seen_from(camera, means)
         lit = torch.cat([heat.to(means), torch.ones_like(seen[:, 2:])], 1)
         drawn = composite(splats, camera, torch.cat([lit, lit * seen[:, 2:]], 1))
         maps, depths = np.split(np.moveaxis(drawn.cpu().numpy(), 2, 0), 2)
@@ -170,9 +172,8 @@ def _views(scene: Answering, heat: Float[Tensor, "n q"]) -> Iterator[list[Shown]
         lens = camera.intrinsics.cpu().numpy()
         points = np.column_stack([(points / points[:, 2:]) @ lens[:2].T, points[:, 2]])
         *matched, surface = depths / np.maximum(maps, 1e-4)
-        focal = float(lens[0, 0])
         yield [
-            Shown(name, one, surface, depth, rows, points, focal)
+            Shown(name, one, surface, depth, rows, points, float(lens[0, 0]))
             for one, depth in zip(maps[:-1] * keep, matched, strict=True)
         ]
 
@@ -186,8 +187,7 @@ def _thing(
         best.setdefault(piece.photo, piece)
     score = float(np.average(relevancy[rows], weights=np.maximum(mass[rows], 1e-9)))
     sightings = [Sighting(name, piece.box) for name, piece in best.items()]
-    number = int(rows[mass[rows].argmax()])
-    return Thing(number, word, score, one.views, *box, rows, sightings)
+    return Thing(int(rows[mass[rows].argmax()]), word, score, one.views, *box, rows, sightings)
 
 
 def _known(thing: Thing, known: Sequence[Thing], mass: Float[Array, " n"]) -> Thing:

@@ -10,8 +10,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int
+from numpy import ndarray as Array
+from scipy.optimize import linear_sum_assignment
+from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
@@ -25,8 +29,8 @@ SMALL = 100_000
 """Most Gaussians of a scene that a page shows without levels of detail."""
 MOST_ROWS = 65_536
 """Most Gaussians of a chunk."""
-_FAN, _ALIGNED = 4, 64
-"""Children of a chunk, and rows of Gaussians; rows of a chunk are a multiple of the latter."""
+_FAN, _ALIGNED, _PROJECTIONS = 4, 64, 16
+"""Children of a chunk and of a Gaussian; what rows of a chunk are a multiple of; numbers of a meaning."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,8 +59,7 @@ class Levels:
         """Measure a chunk: the middle of its Gaussians, the radius around it that holds nearly all of them,
         and their median standard deviation, in world units."""
         scene, rows = self.chunk(number)
-        shown = scene.splats.opacities[rows] > 0
-        if not bool(shown.any()):
+        if not bool((shown := scene.splats.opacities[rows] > 0).any()):
             return [0.0] * 5
         means, scales = scene.splats.means[rows][shown], scene.splats.scales[rows][shown]
         middle = means.median(0).values
@@ -71,8 +74,7 @@ def levels_of(scene: Scene, most: int = MOST_ROWS) -> Levels:
     while count > most * _FAN**depth:
         depth += 1
     rows = -(-count // (_FAN**depth * _ALIGNED)) * _ALIGNED
-    sound = scene.splats.sound()
-    splats = scene.splats
+    sound, splats = scene.splats.sound(), scene.splats
     if scene.looks is None:  # looks change harmonics
         splats = replace(splats, harmonics=harmonics_of(splats.colors(scene.overview.camera.position)))
     filled = torch.arange(rows * _FAN**depth, device=splats.means.device).clamp_max(count - 1)
@@ -81,58 +83,83 @@ def levels_of(scene: Scene, most: int = MOST_ROWS) -> Levels:
     means = torch.where(visible[:, None], splats.means, splats.means[visible].median(0).values)
     quats = torch.where(visible[:, None], splats.quats, splats.quats.new_tensor([1.0, 0, 0, 0]))
     splats = replace(splats, means=means, quats=quats, opacities=splats.opacities * visible)
-    order = kd_order(splats.means)
+    order = tree_order(splats, _meaning(scene)[filled])
     splats, origin = splats.select(order), filled[order]
-    place = torch.empty(count, dtype=torch.long, device=order.device)
-    real = order < count
-    place[order[real]] = real.nonzero().squeeze(1)
     codes = None if scene.codes is None else torch.where(visible[order, None], scene.codes[origin], torch.nan)
-    floats = scene.floating[origin]
-    found = [_level(scene, splats, codes, floats, place)]
-    for _ in range(depth):
-        splats, codes, floats = merged(splats, codes, floats)
-        place = place // _FAN
-        found.append(_level(scene, splats, codes, floats, place))
+    floats, place = scene.floating[origin], order.argsort()[:count]
+    found = []
+    for level in range(depth + 1):
+        if level:
+            splats, codes, floats = merged(splats, codes, floats)
+        coarse = replace(scene, splats=splats, codes=codes, cache=None)
+        found.append(_level(coarse, scene, floats, place // _FAN**level))
     return Levels(found[::-1], rows)
 
 
-def _level(
-    scene: Scene,
-    splats: Splats,
-    codes: Float[Tensor, "n d"] | None,
-    floats: Float[Tensor, " n"],
-    place: Int[Tensor, " m"],
-) -> Scene:
-    """Make the scene of one level. place: its row for each of the scene's own Gaussians."""
-    level = replace(scene, splats=splats, codes=codes, cache=None)
+def _level(level: Scene, scene: Scene, floats: Float[Tensor, " n"], place: Int[Tensor, " m"]) -> Scene:
+    """Give a level the views and floaters of the scene. place: its row for each of the scene's Gaussians."""
     views = {}
     for name, view in scene.visible.items():
-        shares = view.shares.new_zeros(len(splats)).index_add_(0, place[view.rows.long()], view.shares)
+        shares = view.shares.new_zeros(len(floats)).index_add_(0, place[view.rows.long()], view.shares)
         views[name] = VisibleGaussians.of(view.camera, shares * view.size)
     level.__dict__.update(visible=views, floating=floats)  # in place of the cached properties
     return level
 
 
-def kd_order(means: Float[Tensor, "n 3"]) -> Int[Tensor, " n"]:
-    """Order points, a multiple of four, so that each half, quarter and so on, down to groups of four, lies
-    together: a k-d tree that halves the longest side."""
-    start = torch.arange(len(means), device=means.device)
-    return _split(means, start[None])[0]
+def tree_order(splats: Splats, meaning: Float[Tensor, "n d"]) -> Int[Tensor, " n"]:
+    """Order Gaussians, a multiple of 64, so that each four, sixteen and so on lie together and mean alike.
+
+    A k-d tree halves the longest side down to 64 Gaussians, whose extent counts as much as one unit of
+    `meaning`. These are paired by what merging adds to the variance (Ward's criterion), and so are the pairs.
+    Gaussians weigh by the root of opacity times area, lest what is faint vanish in what is heavy.
+    """
+    means, meant, found = splats.means.double().cpu().numpy(), meaning.cpu().numpy(), []
+    weights = (splats.opacities * _area(splats.scales)).sqrt().clamp_min(1e-12).double().cpu().numpy()
+    for node in _halved(means, np.arange(len(means))):
+        away = means[node] - means[node].mean(0)
+        radius = max(np.sqrt(np.square(away).sum(1).mean()), 1e-12)
+        points = np.hstack([away / radius, meant[node]])
+        found.append(node[_tied(points, weights[node])])
+    return torch.from_numpy(np.concatenate(found)).to(splats.means.device)
 
 
-def _split(means: Float[Tensor, "n 3"], nodes: Int[Tensor, "m s"]) -> Int[Tensor, "m s"]:
-    """Order the points of each node. All nodes have as many."""
-    count, size = nodes.shape
-    if size <= _FAN:
-        return nodes
-    points = means[nodes]
-    axis = (points.amax(1) - points.amin(1)).argmax(1)
-    keys = points.gather(2, axis[:, None, None].expand(-1, size, 1))[..., 0]
-    nodes = nodes.gather(1, keys.argsort(1))
-    half = _FAN * (size // (2 * _FAN))
-    if 2 * half == size:
-        return _split(means, nodes.reshape(2 * count, half)).reshape(count, size)
-    return torch.cat([_split(means, nodes[:, :half]), _split(means, nodes[:, half:])], 1)
+def _halved(means: Float[Array, "n 3"], node: Int[Array, " s"]) -> list[Int[Array, " 64"]]:
+    if len(node) <= _ALIGNED:
+        return [node]
+    half, axis = _ALIGNED * (len(node) // (2 * _ALIGNED)), np.ptp(means[node], axis=0).argmax()
+    order = node[np.argpartition(means[node, axis], half)]
+    return [*_halved(means, order[:half]), *_halved(means, order[half:])]
+
+
+def _tied(points: Float[Array, "s d"], weights: Float[Array, " s"]) -> Int[Array, " s"]:
+    """Order points so that successive ones are pairs, then pairs of pairs, and so on."""
+    order = np.arange(len(points))[:, None]
+    while len(order) > 1:
+        pairs = _pairs(cdist(points, points, "sqeuclidean") / (1 / weights[:, None] + 1 / weights))
+        points, shares, order = points[pairs], weights[pairs], order[pairs].reshape(len(pairs), -1)
+        weights = shares.sum(1)
+        points = (points * shares[..., None]).sum(1) / weights[:, None]
+    return order[0]
+
+
+def _pairs(costs: Float[Array, "s s"]) -> Int[Array, "p 2"]:
+    """Pair rows: the best between two halves, and again after some have changed sides."""
+    pairs = np.arange(len(costs)).reshape(-1, 2)
+    for turn in range(2):
+        one, other = np.where(np.arange(len(pairs))[:, None] >> turn & 1, pairs[:, ::-1], pairs).T
+        pairs = np.stack([one, other[linear_sum_assignment(costs[np.ix_(one, other)])[1]]], 1)
+    return pairs
+
+
+def _meaning(scene: Scene) -> Float[Tensor, "n d"]:
+    """Describe what each Gaussian means by a few random projections, with deviation 1 in all."""
+    if scene.codes is None:
+        return scene.splats.means[:, :0]
+    decode = scene.engine.features
+    parts = torch.arange(len(scene.codes), device=scene.device).split(MOST_ROWS)
+    axes = torch.randn(decode(slice(1)).shape[1], _PROJECTIONS, generator=torch.Generator().manual_seed(0))
+    meaning = torch.cat([decode(part).float() @ axes.to(scene.device) for part in parts]).nan_to_num(0)
+    return meaning / meaning.var(0).sum().sqrt().clamp_min(1e-12)
 
 
 def merged(
@@ -155,22 +182,16 @@ def merged(
     total = mass.sum(1)
     weights = torch.where(total[:, None] > 0, mass / total[:, None].clamp_min(1e-30), 1 / _FAN)
     means = mean(fours(splats.means))
-    turns = rotations(splats.quats) * splats.scales[:, None]
+    roots = rotations(splats.quats) * splats.scales[:, None]
     away = fours(splats.means) - means[:, None]
-    covariance = mean(fours(turns @ turns.mT) + away[..., :, None] * away[..., None, :])
+    covariance = mean(fours(roots @ roots.mT) + away[..., :, None] * away[..., None, :])
     variances, axes = torch.linalg.eigh(covariance)
     axes = axes * torch.linalg.det(axes)[:, None, None]  # a rotation, no reflection
     scales = variances.clamp_min(1e-14).sqrt()
     opacities = (total / _area(scales).clamp_min(1e-30)).clamp_max(1.0)
-    quats = Rotation.from_matrix(axes.cpu().double().numpy()).as_quat()[:, [3, 0, 1, 2]]
-    whole = Splats(
-        means,
-        torch.from_numpy(quats).to(means),
-        scales,
-        opacities,
-        mean(fours(splats.harmonics)),
-        splats.antialiased,
-    )
+    turns = Rotation.from_matrix(axes.cpu().double().numpy()).as_quat()[:, [3, 0, 1, 2]]
+    quats, colors = torch.from_numpy(turns).to(means), mean(fours(splats.harmonics))
+    whole = Splats(means, quats, scales, opacities, colors, splats.antialiased)
     if codes is not None:
         known = codes.isfinite().all(1)
         heaviest = torch.where(fours(known), mass, -1.0).argmax(1)

@@ -39,7 +39,7 @@ LEAST_PIXELS, PIXEL_STEPS = 0.05, 12
 # ── splats ──────────────────────────────────────────────────────────────────────────────────────────────
 
 
-def pack_splats(
+def splat_bytes(
     splats: Splats, center: Float[Tensor, "3"], toward: Float[Tensor, "3"]
 ) -> UInt8[Array, "n 16"]:
     """Pack splats into 16 bytes per Gaussian, in Spark's format: red, green, blue, opacity; half-precision
@@ -61,7 +61,7 @@ def pack_splats(
     logs = torch.where(sound, splats.scales, 1.0).clamp_min(1e-30).log()
     scales = ((logs - lowest) * 254 / (highest - lowest)).round().clamp(0, 254) + 1
     packed = np.empty((len(splats), 16), np.uint8)
-    packed[:, :4] = pack_colors(splats, toward)
+    packed[:, :4] = color_bytes(splats, toward)
     packed[:, 4:10] = means.view(np.uint8).reshape(len(splats), 6)
     packed[:, 10:12] = axes
     packed[:, 12:15] = scales.cpu().numpy()
@@ -69,8 +69,8 @@ def pack_splats(
     return packed
 
 
-def pack_colors(splats: Splats, toward: Float[Tensor, "3"]) -> UInt8[Array, "n 4"]:
-    """Convert red, green, blue and opacity to bytes; see `pack_splats`."""
+def color_bytes(splats: Splats, toward: Float[Tensor, "3"]) -> UInt8[Array, "n 4"]:
+    """Convert red, green, blue and opacity to bytes; see `splat_bytes`."""
     values = torch.cat([splats.colors(toward), splats.opacities[:, None]], dim=1)
     values = torch.where(splats.sound()[:, None], values, 0.0).clamp(0, 1)
     return (values * 255).round().byte().cpu().numpy()
@@ -108,7 +108,7 @@ class PackedMeaning:
         return vectors if self.head is None else vectors @ self.head.T
 
 
-def pack_meaning(decoder: Decoder, codes: Float[Tensor, "n d"]) -> PackedMeaning:
+def packed_meaning(decoder: Decoder, codes: Float[Tensor, "n d"]) -> PackedMeaning:
     """Pack codes and a small field or, for wide decoders, decoded rows. Raises UserError if too large."""
     decoded = PerGaussian.of(decoder, codes)
     rows = decoded.rows.cpu()
@@ -158,7 +158,7 @@ def _packed_field(field: SemanticField) -> tuple[dict[str, Any], dict[str, bytes
 # ── views ───────────────────────────────────────────────────────────────────────────────────────────────
 
 
-def pack_view(view: VisibleGaussians, count: int) -> bytes:
+def view_bytes(view: VisibleGaussians, count: int) -> bytes:
     """Pack which Gaussians a view shows (a bit each), and the pixels that each of these fills (a byte)."""
     pixels = view.pixels.float().cpu().numpy()
     keep = pixels >= LEAST_PIXELS

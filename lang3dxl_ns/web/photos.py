@@ -13,8 +13,7 @@ from PIL import Image
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.query.visibility import spread
-from lang3dxl_ns.rendering import Splats
-from lang3dxl_ns.scene.camera import Camera, to_device
+from lang3dxl_ns.scene.camera import seen_from
 from lang3dxl_ns.scene.photo_folder import find_photos
 from lang3dxl_ns.scene.record import SCENE_FILE, ScenePhoto, SceneRecord
 from lang3dxl_ns.web.pack import camera_json
@@ -78,8 +77,9 @@ def extent(scene: Scene) -> list[float]:
     camera = scene.overview.full_camera
     (fx, _, cx), (_, fy, cy), _ = camera.intrinsics.tolist()
     own = [-cx / fx, -cy / fy, (camera.width - cx) / fx, (camera.height - cy) / fy]
-    places, mass = _seen_from(camera, scene.splats), scene.mass
-    middle = float(places[:, 2][scene.splats.sound()].median()) if len(places) else 0.0
+    sound, mass = scene.splats.sound(), scene.mass
+    places = torch.where(sound[:, None], seen_from(camera, scene.splats.means), 0.0)
+    middle = float(places[:, 2][sound].median()) if len(places) else 0.0
     # The sky and distant surroundings lie far behind, and what stands before the landmark hides less of it.
     known, sizes = mass > 0, scene.splats.scales.amax(1)
     kept = (places[:, 2] > 0.5 * middle) & (places[:, 2] < _BEHIND * middle) & known
@@ -96,8 +96,3 @@ def extent(scene: Scene) -> list[float]:
             most = max(sign * own[side], min(_WIDER * sign * own[side], _STEEP))
             ends[side] = sign * max(sign * own[side], min(_ROOM * sign * float(slopes[at]), most))
     return [*ends, middle]
-
-
-def _seen_from(camera: Camera, splats: Splats) -> torch.Tensor:
-    view = to_device(camera.view_matrix.to(splats.means.dtype), splats.means.device)
-    return torch.where(splats.sound()[:, None], splats.means @ view[:3, :3].T + view[:3, 3], 0.0)

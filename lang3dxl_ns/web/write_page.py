@@ -34,18 +34,8 @@ from lang3dxl_ns.query.trust import ALIKE, ANCHORS, CLEARLY, FAINT, FAR, STRICTE
 from lang3dxl_ns.query.visibility import spread
 from lang3dxl_ns.query.vocabulary import closest_word, common_words, same_thing, shipped_vocabulary
 from lang3dxl_ns.things import find, grammar, join, pieces, thing
+from lang3dxl_ns.web import pack
 from lang3dxl_ns.web.levels import MOST_ROWS, SMALL, Levels, levels_of
-from lang3dxl_ns.web.pack import (
-    LEAST_PIXELS,
-    PIXEL_STEPS,
-    PackedMeaning,
-    camera_json,
-    halves,
-    pack_colors,
-    pack_meaning,
-    pack_splats,
-    pack_view,
-)
 from lang3dxl_ns.web.photos import extent, photo_json, photos_shown, small_photo
 from lang3dxl_ns.web.teach import PageWords
 from lang3dxl_ns.words.taught_words import TaughtWord, known_word
@@ -70,15 +60,15 @@ _SUGGESTED = (
     "statues", "stairs", "chimneys", "clock", "trees", "cars", "grass",
 )  # fmt: skip
 """Words that a first visitor is offered, where the scene knows them."""
-_RANKING = ("PEAK", "LARGE", "RIM", "STRONG", "CORE", "JOINED", "OUTLIERS", "DENSE")
-_THINGS = (
-    (pieces, "LEVELS PART DEPTH FILLED"),
-    (join, "SHARED SPLINTER VIEWS CRUMB OFTEN SLIM STRAIGHT"),
-    (thing, "OUTLIERS"),
-    (find, "COLORED SAME"),
-    (grammar, "BESIDE INSIDE CLOSE"),
+_NUMBERS = (
+    ("ranking", view_ranking, "PEAK LARGE RIM STRONG CORE JOINED OUTLIERS DENSE"),
+    ("things", pieces, "LEVELS PART DEPTH FILLED"),
+    ("things", join, "SHARED SPLINTER VIEWS CRUMB OFTEN SLIM STRAIGHT"),
+    ("things", thing, "OUTLIERS"),
+    ("things", find, "COLORED SAME"),
+    ("things", grammar, "BESIDE INSIDE CLOSE"),
 )
-"""Numbers that tell things apart and relate them, by the modules that hold them."""
+"""Numbers that rank views, tell things apart and relate them, by the modules that hold them."""
 _TEXTS = 256
 """Number of texts encoded at a time."""
 _DATA = re.compile(
@@ -128,9 +118,9 @@ class Page:
         self._foreground = prompts_of(scene, within) if within else []
         self._looks = list(scene.looks.names) if scene.looks else []
         self._toward = scene.overview.camera.position.to(scene.device)
-        self._meaning: PackedMeaning | None = None
+        self._meaning: pack.PackedMeaning | None = None
         if scene.decoder is not None and scene.codes is not None:
-            self._meaning = pack_meaning(scene.decoder, scene.codes)
+            self._meaning = pack.packed_meaning(scene.decoder, scene.codes)
         elif self.texts:
             raise UserError(NO_SEMANTICS)
 
@@ -142,7 +132,7 @@ class Page:
         files = {path.name: path.read_bytes() for path in _FILES}
         files["language.js"] = language_module()
         files["spark.bin"] = gzip.compress(_LIBRARY.read_bytes(), mtime=0)
-        files["splats.bin"] = pack_splats(scene.baked(self.look), center, self._toward).tobytes()
+        files["splats.bin"] = pack.splat_bytes(scene.baked(self.look), center, self._toward).tobytes()
         told = self.provenance
         about: dict[str, Any] = {
             "title": told.title or Path(scene.file.data).name,
@@ -155,7 +145,7 @@ class Page:
             "edges": find.axes_of(scene).tolist(),
             "tour": told.tour,
             "meters": None if scene.file.georeference is None else asdict(scene.file.georeference),
-            "start": camera_json(scene.overview.full_camera),
+            "start": pack.camera_json(scene.overview.full_camera),
             "colors": PROMPT_COLORS,
             "live": self.live,
             "prompts": _phrases(self.prompts),
@@ -166,14 +156,12 @@ class Page:
         if self.levels is not None:
             files |= self._chunks(self.levels, center)
             bounds = [self.levels.bounds(number) for number in range(self.levels.chunks)]
-            count = len(self.whole.splats)
-            about["detail"] = {"rows": self.levels.rows, "chunks": bounds, "count": count}
+            about["detail"] = {"rows": self.levels.rows, "chunks": bounds, "count": len(self.whole.splats)}
         files |= self._photos(about)
         about["floaters"] = "api/floaters" if self.live else "floaters.bin"
-        if not self.live:
-            files["floaters.bin"] = self.floaters()
         about["looks"] = {name: f"api/look?photo={quote(name)}" for name in self._looks}
         if not self.live:  # without a server the lightings are files, read when they are chosen
+            files["floaters.bin"] = self.floaters()
             chosen = self._within_limits("lightings", self._looks, [4 * len(scene.splats)] * len(self._looks))
             about["looks"] = {name: f"look{i}.bin" for i, name in enumerate(chosen)}
             files |= {f"look{i}.bin": self.colors(name) for i, name in enumerate(chosen)}
@@ -186,14 +174,14 @@ class Page:
                 "covered": scene.config.min_alpha,
                 "rules": _RULES,
                 "foreign": scene.foreignness,
-                "pixels": [LEAST_PIXELS, PIXEL_STEPS],
+                "pixels": [pack.LEAST_PIXELS, pack.PIXEL_STEPS],
             }
             files |= self._meaning.files | self._vocabulary(self._meaning)
-            packed = {name: pack_view(view, len(scene.splats)) for name, view in scene.visible.items()}
+            packed = {name: pack.view_bytes(view, len(scene.splats)) for name, view in scene.visible.items()}
             views = self._within_limits("views", list(packed), list(map(len, packed.values())))
             files["views.bin"] = b"".join(packed[name] for name in views)
             about["views"] = [
-                {"name": name, "bytes": len(packed[name]), **camera_json(scene.visible[name].camera)}
+                {"name": name, "bytes": len(packed[name]), **pack.camera_json(scene.visible[name].camera)}
                 for name in views
             ]
             about["foreground"] = _phrases(self._foreground)
@@ -222,9 +210,9 @@ class Page:
         for number in tracked(range(1, levels.chunks), "packing details"):
             scene, rows = levels.chunk(number)
             splats = colored[levels.scenes.index(scene)].select(torch.arange(rows.start, rows.stop))
-            parts = [pack_splats(splats, center, self._toward).tobytes(), _bytes(scene.floating[rows])]
+            parts = [pack.splat_bytes(splats, center, self._toward).tobytes(), _bytes(scene.floating[rows])]
             if scene.decoder is not None and scene.codes is not None:
-                packed = pack_meaning(scene.decoder, scene.codes[rows]).files
+                packed = pack.packed_meaning(scene.decoder, scene.codes[rows]).files
                 parts.append(packed.get("codes.bin") or packed["rows.bin"])
             files[f"part{number}.bin"] = b"".join(parts)
         return files
@@ -254,7 +242,7 @@ class Page:
             self.left_out.append(f"{len(names) - count} of {len(names)} {what} are left out, to load quickly")
         return spread(names, count)
 
-    def _vocabulary(self, meaning: PackedMeaning) -> dict[str, bytes]:
+    def _vocabulary(self, meaning: pack.PackedMeaning) -> dict[str, bytes]:
         """Encode the words that the page knows: those that may name a place first, then all others."""
         negatives, taught = list(self.scene.text.config.negatives), self.scene.words
         asked = [phrase for phrases in _phrases([*self.prompts, *self._foreground]) for phrase in phrases]
@@ -285,14 +273,14 @@ class Page:
             anchor: [known_word(word) for word in words if same_thing(anchor, [word])] for anchor in ANCHORS
         }
         listed = json.dumps(described).encode()
-        return {"vocabulary.json": listed, "vocabulary.bin": halves(torch.cat(numbers))}
+        return {"vocabulary.json": listed, "vocabulary.bin": pack.halves(torch.cat(numbers))}
 
-    def _meant(self, meaning: PackedMeaning, word: str) -> tuple[Float[Tensor, "s r"], list[int]]:
+    def _meant(self, meaning: pack.PackedMeaning, word: str) -> tuple[Float[Tensor, "s r"], list[int]]:
         """Return the vectors searched for along with a word, and the negatives that it competes with."""
         queries = self.scene.queries(prompts_of(self.scene, [Prompt(word)]))
         return meaning.of_texts(queries.vectors[list(queries.positive[0])]).cpu(), list(queries.negative[0])
 
-    def _encoded(self, meaning: PackedMeaning, texts: list[str]) -> Iterator[Float[Tensor, "m r"]]:
+    def _encoded(self, meaning: pack.PackedMeaning, texts: list[str]) -> Iterator[Float[Tensor, "m r"]]:
         parts = [texts[row : row + _TEXTS] for row in range(0, len(texts), _TEXTS)]
         for part in tracked(parts, "encoding words"):
             yield meaning.of_texts(self.scene.text.vectors(part).to(self.scene.device)).cpu()
@@ -315,7 +303,7 @@ class Page:
         known = self.scene.words.get(known_word(text))
         return told if known is None else told | {"taught": self._taught(self._meaning, known)}
 
-    def _taught(self, meaning: PackedMeaning, word: TaughtWord) -> dict[str, Any]:
+    def _taught(self, meaning: pack.PackedMeaning, word: TaughtWord) -> dict[str, Any]:
         """Express what examples taught in this scene's own numbers."""
         vector = meaning.of_texts(word.vector[None].to(self.scene.device))[0].tolist()
         return {"vector": vector, "bias": word.bias, "text": word.text, "doubt": word.doubt}
@@ -342,15 +330,15 @@ class Page:
 
     def colors(self, photo: str) -> bytes:
         """Compute every Gaussian's color and opacity in a photo's look. Raises UserError if there is none."""
-        return pack_colors(self.scene.baked(photo), self._toward).tobytes()
+        return pack.color_bytes(self.scene.baked(photo), self._toward).tobytes()
 
 
 def language_module() -> bytes:
     """Write the table of what people type, and the numbers by which views are ranked, as a module."""
     table = {name: value for name, value in TABLE.items() if name != "cases"}
-    table["ranking"] = {name: getattr(view_ranking, name) for name in _RANKING}
-    table["grammar"] = grammar.table()
-    table["things"] = {name: getattr(module, name) for module, names in _THINGS for name in names.split()}
+    table |= {"ranking": {}, "things": {}, "grammar": grammar.table()}
+    for part, module, names in _NUMBERS:
+        table[part] |= {name: getattr(module, name) for name in names.split()}
     return f"export default {json.dumps(table, ensure_ascii=False)};\n".encode()
 
 
@@ -374,15 +362,14 @@ def write_page(page: Page, folder: Path) -> int:
     make_folder(folder)
     index, own = folder / _INDEX.name, [*(path.name for path in _FILES), *_MADE]
     ours = index.is_file() and "<title>A scene to ask</title>" in index.read_text(errors="replace")
-    other = (".bin", *PHOTO_SUFFIXES)  # whoever serves a folder of photos would publish them
+    names, other = {*own, "scene.json", "vocabulary.json"}, (".bin", *PHOTO_SUFFIXES)
     here = sorted(folder.iterdir())
     names = {*own, "scene.json", "vocabulary.json"}
     taken = [path.name for path in here if path.name in names or path.suffix.lower() in other]
-    if taken and not ours:
+    if taken and not ours:  # whoever serves a folder of photos would publish them
         raise UserError(f"{folder} holds {taken[0]}, which is not a scene's page: name a folder of its own")
     files = page.files()
-    data = sorted(files.keys() - {*own})  # modules import each other by their own names
-    data.remove("scene.json")
+    data = sorted(files.keys() - {*own, "scene.json"})
     # Data have names by content, which scene.json lists: a page whose writing is stopped, or whose files a
     # browser or a copy keeps from earlier, never shows the splats of one scene with the words of another.
     named = {name: _by_content(name, files[name]) for name in data}
@@ -393,10 +380,9 @@ def write_page(page: Page, folder: Path) -> int:
         replace_file(folder / name, files[name])
     for name, stored in named.items():
         replace_file(folder / stored, files[name])
-    for name in own:
-        replace_file(folder / name, files[name])
     files["scene.json"] = json.dumps(about).encode()
-    replace_file(folder / "scene.json", files["scene.json"])
+    for name in [*own, "scene.json"]:
+        replace_file(folder / name, files[name])
     for path in here:  # of the page that this one replaces
         if ours and _DATA.fullmatch(path.name) and path.name not in named.values():
             path.unlink(missing_ok=True)

@@ -14,6 +14,7 @@ from lab.benchmarks.questions import Known, ask_all
 from lab.landmark.instances import true_things
 from lab.landmark.landmark import Landmark
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.query.trust import FAR
 from lang3dxl_ns.scene.georeference import Georeference
 from lang3dxl_ns.things.find import Things, axes_of, up_of
 from lang3dxl_ns.things.grammar import Request, Sight, answer, parse, sight_of, table, unsure
@@ -338,3 +339,16 @@ def test_slim_things_are_one_with_what_stands_on_them_and_windows_in_tiers_are_n
     assert joined([shaft, tip, (9, 7, (1, 1, 2)), far]) == [[0, 1], [2], [3]]
     assert joined([(0, 0, (1, 0.2, 2)), (0, 3, (1, 0.2, 2))]) == [[0], [1]]
     assert joined([]) == []
+
+
+def test_counts_are_doubtful_where_the_answer_or_the_scene_is():
+    scene = painted_scene()
+
+    def caution(foreignness: float, text: str = "windows") -> str | None:
+        strange = replace(scene)
+        strange.__dict__.update(foreignness=foreignness)
+        return strange.things(text)[0].caution
+
+    assert caution(1.0) is None
+    assert "as far from what its CLIP was trained on" in caution(FAR)
+    assert caution(1.0, "nothing of the kind") is not None

@@ -11,7 +11,7 @@ from painted_scene import painted_looks, painted_scene, painted_splats
 
 from lang3dxl_ns.rendering import Splats, render
 from lang3dxl_ns.rendering.projection import rotations
-from lang3dxl_ns.web.levels import kd_order, levels_of, merged
+from lang3dxl_ns.web.levels import levels_of, merged, tree_order
 from lang3dxl_ns.web.write_page import Page, write_page
 
 MOST = 500
@@ -35,14 +35,31 @@ def rough_wall(**changes):
     return painted_scene(splats=replace(splats, means=splats.means + F.pad(depths, (2, 0))), **changes)
 
 
+def even_splats(means):
+    """Round Gaussians of one size."""
+    count = len(means)
+    quats, scales = torch.tensor([1.0, 0, 0, 0]).repeat(count, 1), torch.full((count, 3), 0.01)
+    return Splats(means, quats, scales, torch.full((count,), 0.5), torch.zeros(count, 1, 3))
+
+
 def test_an_order_keeps_neighbors_together_at_every_level():
     points = torch.rand(4096 + 320, 3, generator=torch.Generator().manual_seed(0))
-    order = kd_order(points)
+    order = tree_order(even_splats(points), torch.zeros(len(points), 0))
     assert torch.equal(order.sort().values, torch.arange(len(points)))
     for size in (4, 16, 64):
         groups = points[order][: len(points) // size * size].reshape(-1, size, 3)
         side = (groups.amax(1) - groups.amin(1)).amax(1).median()
         assert side < 2.5 * (size / len(points)) ** (1 / 3)  # random groups extend over nearly 1
+
+
+def test_what_means_two_things_is_merged_apart_where_both_stand_mixed():
+    g = torch.Generator().manual_seed(0)
+    points, kind = torch.rand(1024, 3, generator=g), torch.arange(1024) % 2
+    mixed, apart = (
+        (kind[tree_order(even_splats(points), meaning)].reshape(-1, 4).float().std(1) > 0).float().mean()
+        for meaning in (torch.zeros(1024, 0), 2.0 * kind[:, None])
+    )
+    assert mixed > 0.7 and apart < 0.2
 
 
 def test_merged_gaussians_keep_the_moments_of_what_they_stand_for():
