@@ -69,7 +69,7 @@ _QUALITY = 98
 _CHUNK_PHOTOS, _CHUNK_PAIRS, _CHUNK_LEARNED = 8, 100, 5  # a step of the bar, which a killed process loses
 _STAMP = "photos.json"
 _RELAXED = {"init_min_num_inliers": 30, "init_min_tri_angle": 4.0, "abs_pose_min_num_inliers": 15}
-"""Thresholds of the incremental mapper where it finds no model, or no further photo, with the usual ones."""
+"""Thresholds of the incremental mapper where it finds no model with the usual ones."""
 
 
 def reconstruct(
@@ -307,34 +307,27 @@ def match(
 
 
 def _map(database: Path, photos: PhotoFolder, work: Path, kind: str) -> list[pycolmap.Reconstruction]:
-    """Run the mapper and return the models, largest first. The incremental one goes on from the largest with
-    `_RELAXED` thresholds, which are safe by then."""
-    colmap, count = load_pycolmap(), len(photos.names)
+    """Run the mapper and return the models, largest first. The incremental one may need `_RELAXED`."""
+    pycolmap = load_pycolmap()
     settings = {"random_seed": 0, "num_threads": os.cpu_count() or 1}
-    models: list[pycolmap.Reconstruction] = []
+    least = min(_SMALLEST_MODEL, len(photos.names))
     for thresholds in ({},) if kind == "global" else ({}, _RELAXED):
-        bar, parts = progress("photos with a pose", count), TemporaryDirectory(dir=work)
-        with TemporaryDirectory(dir=work) as start, parts as folder, bar as advance:
-            files = database, photos.folder, folder
+        bar = progress("photos with a pose", len(photos.names))
+        with TemporaryDirectory(dir=work) as folder, bar as advance:
             if kind == "global":
-                options = colmap.GlobalPipelineOptions(**settings)
-                found = colmap.global_mapping(*files, options)
+                options = pycolmap.GlobalPipelineOptions(**settings)
+                found = pycolmap.global_mapping(database, photos.folder, folder, options)
             else:
-                limits = {"min_model_size": _SMALLEST_MODEL, "mapper": thresholds}
-                options = colmap.IncrementalPipelineOptions(**limits, **settings)
-                if models:
-                    models[0].write_binary(start)
-                going_on = {"input_path": start if models else "", "next_image_callback": advance}
-                found = colmap.incremental_mapping(*files, options, **going_on)
-        least = models[0].num_reg_images() if models else min(_SMALLEST_MODEL, count)
-        sound = [m for m in found.values() if m.num_reg_images() >= least and m.num_points3D()]
-        if sound:
-            placed = cameras_of(sound[0]).keys()
-            others = [model for model in models[1:] if not cameras_of(model).keys() <= placed]
-            models = sorted(sound + others, key=lambda model: -model.num_reg_images())
-        if models and models[0].num_reg_images() == count:
+                options = pycolmap.IncrementalPipelineOptions(
+                    min_model_size=_SMALLEST_MODEL, mapper=thresholds, **settings
+                )
+                found = pycolmap.incremental_mapping(
+                    database, photos.folder, folder, options, next_image_callback=advance
+                )
+        models = [m for m in found.values() if m.num_reg_images() >= least and m.num_points3D()]
+        if models:
             break
-    return models
+    return sorted(models, key=lambda model: -model.num_reg_images())
 
 
 def _doubts(database: Path, model: pycolmap.Reconstruction) -> dict[int, str]:
@@ -347,7 +340,10 @@ def _map_without(
     pairs: Collection[tuple[int, int]], database: Path, photos: PhotoFolder, work: Path, kind: str
 ) -> list[pycolmap.Reconstruction]:
     """Map without some pairs."""
-    say(f"{len(pairs)} pairs contradict others, as where sides look alike: mapping anew without them")
+    say(
+        f"{len(pairs)} pairs of photos contradict others, as on a building that looks alike from several "
+        "sides: mapping anew without them"
+    )
     with TemporaryDirectory(dir=work) as folder:
         consistent = Path(folder) / "database.db"
         copy_without(pairs, database, consistent)

@@ -2,7 +2,6 @@
 
 import os
 import shutil
-from pathlib import Path
 
 import numpy as np  # before pycolmap
 import pycolmap
@@ -93,21 +92,6 @@ def test_contradicting_pairs_are_left_out_of_a_second_model(photos, monkeypatch,
     assert "mapping anew without them" in capsys.readouterr().out
     assert (report.registered, report.contradicting) == (7, 1)
     assert not list((photos / "work").glob("tmp*"))
-
-
-def test_mapping_goes_on_from_the_largest_model_where_photos_are_left(photos, monkeypatch):
-    noise = np.random.default_rng(0).integers(0, 255, (180, 240, 3), np.uint8)
-    Image.fromarray(noise).save(photos / "images" / "noise.jpg")
-    run, started = pycolmap.incremental_mapping, []
-
-    def mapping(*files, input_path, **options):
-        started.append(input_path and (Path(input_path) / "images.bin").is_file())
-        return run(*files, input_path=input_path, **options)
-
-    monkeypatch.setattr(pycolmap, "incremental_mapping", mapping)
-    report = reconstruct(find_photos(photos), photos / "work", photos / "sparse", SIFT)
-    assert started == ["", True]
-    assert (report.registered, len(report.left_out), report.other_models) == (7, 1, ())
 
 
 def test_honest_photos_have_no_contradictions(reconstructed):
