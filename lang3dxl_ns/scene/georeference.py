@@ -125,7 +125,9 @@ def georeference(
         return None
     heading = 1j / (factor / abs(factor))  # the plan's direction that points north
     axis = heading.real * east + heading.imag * north
-    return Georeference(float(abs(factor)), _triple(unit_up), _triple(axis), uncertainty, int(agree.sum()))
+    return Georeference(
+        float(abs(factor)), tuple(unit_up.tolist()), tuple(axis.tolist()), uncertainty, int(agree.sum())
+    )
 
 
 def local_meters(positions: Iterable[tuple[float, float, float]]) -> Float64[Array, "n 3"]:
@@ -170,7 +172,3 @@ def _degrees(parts: Sequence[float], side: str, negative: str) -> float:
     if not np.isfinite(value):
         raise ValueError(f"{value} degrees")
     return -value if side == negative else value
-
-
-def _triple(vector: Float64[Array, "3"]) -> tuple[float, float, float]:
-    return float(vector[0]), float(vector[1]), float(vector[2])
