@@ -35,11 +35,8 @@ class _Scored:
 @showing("maps", "ground_truth", "out")
 @dataclass(kw_only=True)
 class EvaluateMaps(_Scored):
-    """Score relevancy maps made by any system, and write scores.md and scores.json.
-
-    Maps are in a folder per prompt, as `<prompt>/<photo>.npy` (float) or a picture. `lang3dxl query` also
-    writes them so.
-    """
+    """Score relevancy maps made by any system, and write scores.md and scores.json. Maps are in a folder per
+    prompt, as `<prompt>/<photo>.npy` (float) or a picture. `lang3dxl query` also writes them so."""
 
     maps: Path
     """Folder of the maps."""
@@ -71,10 +68,8 @@ class EvaluateMaps(_Scored):
 @showing("run", "split", "ground_truth", "out")
 @dataclass(kw_only=True)
 class EvaluateRun(_Scored):
-    """Score a trained run like `ns-eval`, but on photos and with ground truth of your choice.
-
-    Writes scores.md and scores.json.
-    """
+    """Score a trained run like `ns-eval`, but on photos and with ground truth of your choice. Writes
+    scores.md and scores.json."""
 
     run: tyro.conf.Positional[Path | None] = None
     """Folder of the run, or its config.yml (default: the newest under outputs/). For a .scene file, or a
@@ -128,12 +123,12 @@ class EvaluateRun(_Scored):
 
 @dataclass(kw_only=True)
 class EvaluateThings:
-    """Score single things against the boxes of a COCO file, and write things.md and things.json."""
+    """Score single things against the boxes of labels, and write things.md and things.json."""
 
     scene: tyro.conf.Positional[Path | None] = None
     """A .scene file, a folder that holds one, or a run (default: the newest under outputs/)."""
     coco: Path
-    """COCO instances: boxes in photos of the scene; their categories are the words."""
+    """COCO instances, or a folder of LERF-OVS labels: boxes in photos; their categories are the words."""
     out: Path
     """Folder for the report."""
 
@@ -184,9 +179,7 @@ class EvaluatePool:
 @dataclass(kw_only=True)
 class EvaluateSplit:
     """Choose labeled photos to hold out of training, up to five that show each category, always the same.
-
-    Pass the list to `ns-train lang3dxl … lang3dxl-colmap --held-out FILE`.
-    """
+    Pass the list to `ns-train lang3dxl … lang3dxl-colmap --held-out FILE`."""
 
     ground_truth: Path
     """Folder of the scene's ground truth."""

@@ -1,4 +1,4 @@
-"""Scores of single things against COCO instances: boxes that people drew in photos."""
+"""Scores of single things against boxes that people drew in photos: COCO instances, or LERF-OVS labels."""
 
 from __future__ import annotations
 
@@ -12,18 +12,27 @@ from scipy.optimize import linear_sum_assignment
 
 from lang3dxl_ns.common.errors import UserError, readable
 from lang3dxl_ns.common.files import read_json
+from lang3dxl_ns.evaluation.ground_truth import GroundTruth
 from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.things.write import coco
 
 
 def score_things(scene: Scene, path: Path) -> list[tuple[str, int, int, int, float]]:
-    """Compare the things of each category of a COCO file with its boxes, in the photos that it names. Return
-    for each word the number of boxes there, found (intersection over union of at least a half) and false, and
-    F1. Raises UserError for other files."""
-    with readable(f"{path} holds no COCO instances", "export the boxes from the labeling tool as COCO"):
-        content = read_json(path)
-        true, words = _boxes(content), [str(category["name"]) for category in content["categories"]]
-        names = {image["file_name"] for image in content["images"]} & {photo.name for photo in scene.photos}
+    """Compare the things of each category of a COCO file, or of a folder of LERF-OVS labels, with its boxes,
+    in the photos that it names. Return for each word the number of boxes there, found (intersection over
+    union of at least a half) and false, and F1. Raises UserError for other files."""
+    sizes = {photo.name: photo.file_size for photo in scene.photos}
+    if path.is_dir():
+        labels = GroundTruth(path, "lerf_ovs")
+        labels.check(sizes)
+        words, names = labels.categories, {name for name in sizes if labels.key(name)}
+        marked = ((n, word, one) for n in names for word, one in labels.truths(n, sizes[n][::-1]).items())
+        true = {(n, word): (np.array(one.boxes) / (2 * sizes[n])).tolist() for n, word, one in marked}
+    else:
+        with readable(f"{path} holds no COCO instances", "export the boxes from the labeling tool as COCO"):
+            content = read_json(path)
+            true, words = _boxes(content), [str(category["name"]) for category in content["categories"]]
+            names = {image["file_name"] for image in content["images"]} & sizes.keys()
     if not names or not words:
         raise UserError(f"{path} names no photo of this scene: file_name must be {scene.photos[0].name}, …")
     given, scores = _boxes(coco(scene, scene.things(words))), []

@@ -11,9 +11,10 @@ import json
 import os
 import shutil
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from itertools import combinations
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
@@ -62,6 +63,8 @@ _ERROR = 0.005
 """Largest distance of a point from its pixel that agrees with a pose, relative to the longer side."""
 _TRUST = 1.1
 """How many times as many points must agree with a camera of its own as with one of the model's."""
+_SOUND = 4.0, 1.5
+"""Largest error in pixels and smallest angle in degrees of a new point, as in COLMAP's mapper."""
 _PARTS = ("cameras", "images", "points3D", "rigs", "frames")
 
 
@@ -121,14 +124,19 @@ def add_photos(
             placed = scene.place_all([ids[name] for name in targets if name in ids])
             doubtful = scene.doubts(placed)
             found = {scene.names[i]: (i, photo) for i, photo in placed.items()}
-            for name, (i, photo) in found.items():
-                _add(model, photo, targets[name], db.read_keypoints(i)[:, :2].astype(float))
+            numbers = {
+                i: _add(model, photo, targets[name], db.read_keypoints(i)[:, :2].astype(float))
+                for name, (i, photo) in found.items()
+            }
+            _triangulate(model, db, numbers)
     lost = {targets[n]: left_out.get(n, "too few of its matches agree") for n in targets if n not in found}
     doubtful = {targets[name]: why for name, why in doubtful.items()}
     told = reasons_in_words({"without a place": lost, "doubtfully placed": doubtful})
     if not found:
         raise UserError(f"none of the {len(targets)} new photos finds a place; {'; '.join(told)}")
     _copy(images, {name: targets[name] for name in found})
+    for image in numbers.values():
+        model.extract_colors_for_image(image, images)  # only of points without a color
     kept = _replace(place, model, work.parent)
     write_picture(model, doubtful | doubtful_photos(work.parent.parent), work.parent)
     _report(work.parent / REPORT.name, len(targets), len(found), doubtful)
@@ -292,8 +300,8 @@ def _solve(
     return found if _FOCAL[0] < focal < _FOCAL[1] else None
 
 
-def _add(model: pycolmap.Reconstruction, photo: _Placed, name: str, keypoints: Float[Array, "n 2"]) -> None:
-    """Add a placed photo to the model, under new numbers."""
+def _add(model: pycolmap.Reconstruction, photo: _Placed, name: str, keypoints: Float[Array, "n 2"]) -> int:
+    """Add a placed photo to the model, and return its number there."""
     pycolmap = load_pycolmap()
     photo.camera.camera_id = max([*model.cameras, *model.rigs]) + 1
     model.add_camera_with_trivial_rig(photo.camera)
@@ -302,6 +310,30 @@ def _add(model: pycolmap.Reconstruction, photo: _Placed, name: str, keypoints: F
     model.add_image_with_trivial_frame(image, photo.camera_from_world)
     for feature in np.flatnonzero(photo.points >= 0).tolist():
         model.add_observation(int(photo.points[feature]), pycolmap.TrackElement(number, feature))
+    return number
+
+
+def _triangulate(
+    model: pycolmap.Reconstruction, database: pycolmap.Database, added: Mapping[int, int]
+) -> None:
+    """Add the points that matches among new photos show; the model's own stay where they are.
+
+    Args:
+        added: numbers of the new photos: in the database → in the model.
+    """
+    pycolmap = load_pycolmap()
+    known, matches = set(model.points3D), pycolmap.CorrespondenceGraph()
+    for number, image in model.images.items():
+        matches.add_image(number, image.num_points2D())
+    for one, other in combinations(added, 2):
+        if database.exists_two_view_geometry(one, other):
+            geometry = database.read_two_view_geometry(one, other)
+            matches.add_two_view_geometry(added[one], added[other], geometry)
+    matches.finalize()
+    options = pycolmap.IncrementalTriangulatorOptions(ignore_two_view_tracks=False, random_seed=0)
+    for number in added.values():
+        pycolmap.IncrementalTriangulator(matches, model).triangulate_image(options, number)
+    pycolmap.ObservationManager(model, matches).filter_points3D(*_SOUND, set(model.points3D) - known)
 
 
 def _copy(images: Path, targets: dict[str, str]) -> None:

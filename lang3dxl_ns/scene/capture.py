@@ -154,15 +154,8 @@ class Capture:
 
     def _named(self, path: Path) -> frozenset[str]:
         """Read a list of photos, which may lack folders or endings. Raises UserError for an unknown one."""
-        forms = {
-            name: {
-                name,
-                str(PurePosixPath(name).with_suffix("")),
-                PurePosixPath(name).name,
-                PurePosixPath(name).stem,
-            }
-            for name in (*self.names, *self.left_out)
-        }
+        paths = {name: PurePosixPath(name) for name in (*self.names, *self.left_out)}
+        forms = {n: {n, str(path.with_suffix("")), path.name, path.stem} for n, path in paths.items()}
         found = set()
         for name in read_names(path):
             fitting = [name] if name in forms else [known for known in forms if name in forms[known]]

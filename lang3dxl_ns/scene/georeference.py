@@ -21,6 +21,7 @@ from PIL import ExifTags
 from lang3dxl_ns.common.checks import expect, is_coordinate
 from lang3dxl_ns.common.pictures import NoPictureError, open_picture
 from lang3dxl_ns.scene.colmap import load_pycolmap
+from lang3dxl_ns.scene.frame import turned_to
 
 LEAST_PHOTOS = 3
 """Number of photos that must agree on a position."""
@@ -104,7 +105,7 @@ def georeference(
     known = [i for i, position in enumerate(positions) if position is not None]
     if len(known) < LEAST_PHOTOS:
         return None
-    east, north = _ground_axes(up)
+    east, north, unit_up = turned_to(up, (0, 0, 1))
     ground = centers[known] @ np.stack([east, north], axis=1)
     plan = ground[:, 0] + 1j * ground[:, 1]
     places = local_meters([p for p in positions if p is not None])
@@ -124,7 +125,6 @@ def georeference(
         return None
     heading = 1j / (factor / abs(factor))  # the plan's direction that points north
     axis = heading.real * east + heading.imag * north
-    unit_up = np.asarray(up) / np.linalg.norm(up)
     return Georeference(float(abs(factor)), _triple(unit_up), _triple(axis), uncertainty, int(agree.sum()))
 
 
@@ -142,20 +142,9 @@ def local_meters(positions: Iterable[tuple[float, float, float]]) -> Float64[Arr
     return meters
 
 
-def _ground_axes(up: Float64[Array, "3"]) -> tuple[Float64[Array, "3"], Float64[Array, "3"]]:
-    """Return two unit vectors that form a right-handed frame with up."""
-    unit = np.asarray(up, dtype=np.float64) / np.linalg.norm(up)
-    first = np.cross(unit, np.eye(3)[np.abs(unit).argmin()])
-    first /= np.linalg.norm(first)
-    return first, np.cross(unit, first)
-
-
 def _largest_agreement(plan: Array, target: Array) -> Bool[Array, " n"]:
     """Find the largest set of photos that one similarity of the plane moves to their positions."""
-    pairs = list(combinations(range(len(plan)), 2))
-    if len(pairs) > _PAIRS:
-        chosen = np.random.default_rng(0).choice(len(pairs), _PAIRS, replace=False)
-        pairs = [pairs[i] for i in chosen]
+    pairs = np.random.default_rng(0).permutation(list(combinations(range(len(plan)), 2)))[:_PAIRS]
     best = np.zeros(len(plan), dtype=bool)
     for a, b in pairs:
         if (length := plan[b] - plan[a]) != 0:

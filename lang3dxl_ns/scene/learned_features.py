@@ -9,13 +9,12 @@ from __future__ import annotations
 
 import contextlib
 import io
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from importlib.util import find_spec
-from itertools import combinations
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 import torch
@@ -30,10 +29,6 @@ from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.pictures import eight_bits, open_picture
 from lang3dxl_ns.scene.colmap import load_pycolmap
 from lang3dxl_ns.scene.pairing import NEIGHBORS
-from lang3dxl_ns.scene.photo_folder import PhotoFolder
-
-if TYPE_CHECKING:
-    import pycolmap
 
 ALIKE = 0.82
 """Cosine of mutual nearest descriptors from which they count as a possible match."""
@@ -43,6 +38,8 @@ PARTNERS = 12
 """Photos with the most possible matches that each photo is matched with at least."""
 MOST_ON_CPU = 100
 """Photos up to which learned features are the default without a GPU; a pair takes 1 to 4 seconds there."""
+KEPT = "xfeat"
+"""Folder of descriptors, beside the database."""
 _MULTIPLE = 32
 """XFeat's networks need sides that are multiples of this."""
 
@@ -124,49 +121,42 @@ class Networks:
         return self._matcher(data)["matches"][0].cpu()
 
 
-def extract_learned(database: Path, photos: PhotoFolder, kept: Path, max_size: int, count: int) -> None:
-    """Extract the features that are missing in the database, and keep their descriptors in `kept`."""
+def extract_learned(database: Path, folder: Path, names: Sequence[str], max_size: int, count: int) -> None:
+    """Extract the features of photos, and keep their descriptors beside the database."""
+    kept, networks = database.with_name(KEPT), Networks()
     kept.mkdir(exist_ok=True)
-    networks = Networks()
-    with load_pycolmap().Database.open(database) as db:
-        ids = {image.name: image.image_id for image in db.read_all_images()}
-        missing = [n for n in photos.names if n in ids and not db.exists_keypoints(ids[n])]
-        with progress("features of photos", len(missing)) as advance:
-            for name in missing:
-                features = networks.features(photos.folder / name, max_size, count)
-                features.save(_kept(kept, name))  # first, so that what the database has can be matched
-                db.write_keypoints(ids[name], features.keypoints.numpy())
-                advance(1)
+    with load_pycolmap().Database.open(database) as db, progress("features of photos", len(names)) as advance:
+        for name in names:
+            features = networks.features(folder / name, max_size, count)
+            features.save(_kept(database, name))  # first, so that what the database has can be matched
+            db.write_keypoints(db.read_image_with_name(name).image_id, features.keypoints.numpy())
+            advance(1)
 
 
-def match_learned(database: Path, names: Sequence[str], kept: Path, new: Collection[str]) -> None:
-    """Match and verify the pairs of photos that may overlap, with one of `new`, and are missing in the
-    database."""
-    pycolmap = load_pycolmap()
-    with pycolmap.Database.open(database) as db:
-        ids = {image.name: image.image_id for image in db.read_all_images()}
-        known = {n: Features.load(_kept(kept, n)) for n in names if n in ids and db.exists_keypoints(ids[n])}
-        wanted = [(a, b) for a, b in alike_pairs(known) if a in new or b in new]
-        pairs = [(a, b) for a, b in wanted if not db.exists_matches(ids[a], ids[b])]
-        networks = Networks()
-        with progress("pairs of photos", len(pairs)) as advance:
-            for a, b in pairs:
-                db.write_matches(
-                    ids[a], ids[b], networks.matches(known[a], known[b]).numpy().astype(np.uint32)
-                )
-                advance(1)
-        unverified = [
-            pair for pair in combinations(known, 2) if _is_unverified(db, ids[pair[0]], ids[pair[1]])
-        ]
-    listed = database.with_name("pairs.txt")
-    listed.write_text("".join(f"{a} {b}\n" for a, b in unverified))
-    if unverified:
-        pycolmap.verify_matches(database, listed)
+class LearnedMatcher:
+    """Matches of photos by the features that `extract_learned` kept."""
+
+    def __init__(self, database: Path, names: Sequence[str]) -> None:
+        self._database, self._networks = database, Networks()
+        self._features = {name: Features.load(_kept(database, name)) for name in names}
+
+    def pairs(self) -> list[tuple[str, str]]:
+        """List the pairs of photos that may overlap."""
+        return alike_pairs(self._features)
+
+    def match(self, pairs: Sequence[tuple[str, str]]) -> None:
+        """Write the matches of pairs to the database, unless it has them."""
+        with load_pycolmap().Database.open(self._database) as db:
+            for names in pairs:
+                ids = [db.read_image_with_name(name).image_id for name in names]
+                if not db.exists_matches(*ids):
+                    matches = self._networks.matches(*(self._features[name] for name in names))
+                    db.write_matches(*ids, matches.numpy().astype(np.uint32))
 
 
 def alike_pairs(
     photos: Mapping[str, Features], neighbors: int = NEIGHBORS, sample: int = 1_000
-) -> Iterator[tuple[str, str]]:
+) -> list[tuple[str, str]]:
     """Choose the pairs of photos that may overlap, by mutual nearest descriptors among their `sample` best
     features. Every photo gets its `PARTNERS` most alike, and others with at least `LEAST_ALIKE` possible
     matches, up to `neighbors`."""
@@ -174,18 +164,17 @@ def alike_pairs(
     counts = np.zeros((len(names), len(names)), dtype=int)
     best = [photos[name].descriptors[:sample] for name in names]
     with progress("photos compared", len(names)) as advance:
-        for i, j in combinations(range(len(names)), 2):
-            counts[i, j] = counts[j, i] = possible_matches(best[i], best[j])
-            if j == len(names) - 1:
-                advance(1)
-        advance(1)
+        for i in range(len(names)):
+            for j in range(i):
+                counts[i, j] = counts[j, i] = possible_matches(best[i], best[j])
+            advance(1)
     order = np.argsort(-counts, axis=1, kind="stable")
     chosen = set()
     for i in range(len(names)):
         for place, j in enumerate(order[i][: min(neighbors, len(names) - 1)].tolist()):
             if i != j and (place < PARTNERS or counts[i, j] >= LEAST_ALIKE):
-                chosen.add((min(i, j), max(i, j)))
-    return ((names[i], names[j]) for i, j in sorted(chosen))
+                chosen.add((names[min(i, j)], names[max(i, j)]))
+    return sorted(chosen)
 
 
 def possible_matches(first: Float[Tensor, "n c"], second: Float[Tensor, "m c"]) -> int:
@@ -199,9 +188,5 @@ def possible_matches(first: Float[Tensor, "n c"], second: Float[Tensor, "m c"]) 
     return int((mutual & (value >= ALIKE)).sum())
 
 
-def _kept(folder: Path, name: str) -> Path:
-    return folder / f"{Path(name).stem}.safetensors"
-
-
-def _is_unverified(db: pycolmap.Database, first: int, second: int) -> bool:
-    return db.exists_matches(first, second) and not db.exists_two_view_geometry(first, second)
+def _kept(database: Path, name: str) -> Path:
+    return database.with_name(KEPT) / f"{Path(name).stem}.safetensors"

@@ -46,10 +46,9 @@ class NameFinder:
         parts = normal_parts(name)
         if not parts:
             return []
-        whole = self._files.get(parts[-1], [])
-        if whole:
-            return _deepest(parts[:-1], whole)
-        return _deepest(parts[:-1], self._stems.get(parts[-1], []) or self._stems.get(_stem(parts[-1]), []))
+        *folders, last = parts
+        fitting = self._files.get(last) or self._stems.get(last) or self._stems.get(_stem(last), [])
+        return _deepest(tuple(folders), fitting)
 
 
 def _stem(name: str) -> str:

@@ -31,7 +31,7 @@ from lang3dxl_ns.common.reports import timed
 from lang3dxl_ns.scene.camera_picture import camera_picture
 from lang3dxl_ns.scene.colmap import load_pycolmap
 from lang3dxl_ns.scene.companions import cache_folder
-from lang3dxl_ns.scene.learned_features import extract_learned, features_for, match_learned
+from lang3dxl_ns.scene.learned_features import LearnedMatcher, extract_learned, features_for
 from lang3dxl_ns.scene.pairing import pairs_to_match
 from lang3dxl_ns.scene.photo_folder import (
     PhotoFolder,
@@ -66,7 +66,7 @@ _SMALLEST_MODEL = 3  # photos; COLMAP's default of ten may exceed the number of 
 _ENDINGS = {"JPEG": ".jpg", "MPO": ".jpg", "PNG": ".png", "TIFF": ".tif", "BMP": ".bmp"}
 """Formats that COLMAP reads; others become JPEGs of this quality."""
 _QUALITY = 98
-_CHUNK_PHOTOS, _CHUNK_PAIRS = 8, 100  # per step of the progress bar; a killed process loses one step
+_CHUNK_PHOTOS, _CHUNK_PAIRS, _CHUNK_LEARNED = 8, 100, 5  # a step of the bar, which a killed process loses
 _STAMP = "photos.json"
 _RELAXED = {"init_min_num_inliers": 30, "init_min_tri_angle": 4.0, "abs_pose_min_num_inliers": 15}
 """Thresholds of the incremental mapper where it finds no model with the usual ones."""
@@ -256,13 +256,12 @@ def feature_database(
 
 def extract(database: Path, photos: PhotoFolder, settings: ReconstructionSettings) -> None:
     """Extract the features that are missing in the database."""
-    if settings.features == "xfeat":
-        size, count = settings.max_size, settings.max_features
-        return extract_learned(database, photos, database.with_name("xfeat"), size, count)
     pycolmap = load_pycolmap()
     with pycolmap.Database.open(database) as db:
         done = {image.name for image in db.read_all_images() if db.exists_keypoints(image.image_id)}
     missing = [name for name in photos.names if name not in done]
+    if settings.features == "xfeat":
+        return extract_learned(database, photos.folder, missing, settings.max_size, settings.max_features)
     options = pycolmap.FeatureExtractionOptions(
         max_image_size=settings.max_size,
         num_threads=_threads(_MEMORY_PER_THREAD * (settings.max_size / 1600) ** 2),
@@ -281,24 +280,29 @@ def match(
     """Find and verify the matches of pairs that are missing in the database, only those with one of `new`
     where that is given."""
     new = set(names if new is None else new)
-    if settings.features == "xfeat":
-        return match_learned(database, names, database.with_name("xfeat"), new)
     pycolmap = load_pycolmap()
     with pycolmap.Database.open(database) as db:
         ids = {image.name: image.image_id for image in db.read_all_images()}
         known = [n for n in names if n in ids and db.num_keypoints_for_image(ids[n])]
-        pairs = pairs_to_match(known, lambda name: db.read_descriptors(ids[name]).data)
+        learned = LearnedMatcher(database, known) if settings.features == "xfeat" else None
+        read = db.read_descriptors
+        pairs = learned.pairs() if learned else pairs_to_match(known, lambda name: read(ids[name]).data)
         has = db.exists_matches, db.exists_two_view_geometry
         wanted = [pair for pair in pairs if not new.isdisjoint(pair)]
         missing = [(a, b) for a, b in wanted if not all(there(ids[a], ids[b]) for there in has)]
     options = pycolmap.FeatureMatchingOptions(num_threads=_threads(5e8))
     listed = database.with_name("pairs.txt")
     pairing = pycolmap.ImportedPairingOptions(match_list_path=listed)
+    size = _CHUNK_LEARNED if learned else _CHUNK_PAIRS
     with progress("pairs of photos", len(missing)) as advance:
-        for start in range(0, len(missing), _CHUNK_PAIRS):
-            chunk = missing[start : start + _CHUNK_PAIRS]
+        for start in range(0, len(missing), size):
+            chunk = missing[start : start + size]
             listed.write_text("".join(f"{a} {b}\n" for a, b in chunk))
-            pycolmap.match_image_pairs(database, options, pairing)
+            if learned:
+                learned.match(chunk)
+                pycolmap.verify_matches(database, listed)
+            else:
+                pycolmap.match_image_pairs(database, options, pairing)
             advance(len(chunk))
 
 

@@ -19,7 +19,7 @@ from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import UserError, is_plain, readable
 from lang3dxl_ns.common.files import read_json
 from lang3dxl_ns.scene.camera import Lens, check_pose, rigid, view_matrix
-from lang3dxl_ns.scene.colmap import TrackedPhoto
+from lang3dxl_ns.scene.colmap import FISHEYE_MODELS, PERSPECTIVE_MODELS, TrackedPhoto
 from lang3dxl_ns.scene.companions import inside
 from lang3dxl_ns.scene.names import resolve
 from lang3dxl_ns.scene.photo import stored_size
@@ -31,13 +31,10 @@ SPLITS = ("transforms_train.json", "transforms_val.json", "transforms_test.json"
 """Files of Blender's scenes, one for each part of the split."""
 _MOST_BYTES = 1 << 30
 _PERSPECTIVE = {
-    **dict.fromkeys(("OPENCV", "PERSPECTIVE"), ("k1", "k2", "p1", "p2", "k3")),
-    **dict.fromkeys(("PINHOLE", "SIMPLE_PINHOLE"), ("k1", "k2", "p1", "p2", "k3")),
-    **dict.fromkeys(("SIMPLE_RADIAL", "RADIAL"), ("k1", "k2", "p1", "p2", "k3")),
+    **dict.fromkeys(("PERSPECTIVE", *PERSPECTIVE_MODELS), ("k1", "k2", "p1", "p2", "k3")),
     "FULL_OPENCV": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
 }
 """Coefficients of the camera models, in OpenCV's order. Programs write those of another model, too."""
-_FISHEYE = ("OPENCV_FISHEYE", "FISHEYE", "SIMPLE_FISHEYE", "RADIAL_FISHEYE", "SIMPLE_RADIAL_FISHEYE")
 _LISTS = ("train_filenames", "val_filenames", "test_filenames")
 _NOTHING = np.zeros((0, 3))
 
@@ -237,7 +234,7 @@ def _photo(folder: Path, name: str, frame: Mapping[str, Any]) -> tuple[TrackedPh
 def _lens(frame: Mapping[str, Any], path: Path, name: str) -> Lens:
     model = str(frame.get("camera_model", "OPENCV"))
     upper = model.upper()
-    fisheye = upper in _FISHEYE or bool(frame.get("is_fisheye"))  # instant-ngp's form
+    fisheye = upper in FISHEYE_MODELS or bool(frame.get("is_fisheye"))  # instant-ngp's form
     if upper not in _PERSPECTIVE and not fisheye:
         raise UserError(
             f"photo {name} has a {model[:40]} camera, which can't be undistorted here: undistort it first "

@@ -155,10 +155,8 @@ def _meaning(scene: Scene) -> Float[Tensor, "n d"]:
     """Describe what each Gaussian means by a few random projections, with deviation 1 in all."""
     if scene.codes is None:
         return scene.splats.means[:, :0]
-    parts, decode = (
-        torch.arange(len(scene.codes), device=scene.device).split(MOST_ROWS),
-        scene.engine.features,
-    )
+    decode = scene.engine.features
+    parts = torch.arange(len(scene.codes), device=scene.device).split(MOST_ROWS)
     axes = torch.randn(decode(slice(1)).shape[1], _PROJECTIONS, generator=torch.Generator().manual_seed(0))
     meaning = torch.cat([decode(part).float() @ axes.to(scene.device) for part in parts]).nan_to_num(0)
     return meaning / meaning.var(0).sum().sqrt().clamp_min(1e-12)

@@ -33,6 +33,30 @@ def test_own_boxes_score_full_marks_in_any_size_and_each_is_found_once(tmp_path)
     assert found < count and false == count - found
 
 
+def test_labels_of_lerf_ovs_score_as_the_same_boxes_in_coco(tmp_path):
+    scene, file, folder = painted_scene(), tmp_path / "labels.json", tmp_path / "labels"
+    content = coco(scene, scene.things("windows"))
+    content["annotations"] = content["annotations"][1:]
+    file.write_text(json.dumps(content))
+    folder.mkdir()
+    for image in content["images"]:
+        own = [one["bbox"] for one in content["annotations"] if one["image_id"] == image["id"]]
+        objects = [
+            {
+                "category": "windows",
+                "bbox": [x, y, x + w, y + h],
+                "segmentation": [[x, y], [x + w, y], [x, y + h]],
+            }
+            for x, y, w, h in own
+        ]
+        labels = {"info": {"width": image["width"], "height": image["height"]}, "objects": objects}
+        (folder / image["file_name"].split("/")[1]).with_suffix(".json").write_text(json.dumps(labels))
+    scores = score_things(scene, folder)
+    assert [score[:3] for score in scores] == [score[:3] for score in score_things(scene, file)]
+    with pytest.raises(UserError, match=r"labels\.json can't be used"):
+        score_things(scene, tmp_path)
+
+
 FLAT = {
     "images": [{"id": 1, "file_name": "x", "width": 0, "height": 1}],
     "categories": [{"id": 1, "name": "x"}],

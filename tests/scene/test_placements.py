@@ -1,10 +1,11 @@
 """Doubtful placements: none on an honest model; a photo on the wrong side is named."""
 
-import numpy as np
+import numpy as np  # before pycolmap
+import pycolmap
 import pytest
 from scipy.spatial.transform import Rotation
 
-from lang3dxl_ns.scene.placements import MatchedPair, doubtful_placements
+from lang3dxl_ns.scene.placements import MatchedPair, doubtful_placements, matched_pairs
 
 
 def turned(degrees: float) -> np.ndarray:
@@ -47,3 +48,27 @@ def test_a_photo_that_hangs_on_one_other_is_named(ring):
     rotations[12] = turned(15)
     last = MatchedPair(0, 12, 40, rotations[12] @ rotations[0].T)
     assert doubtful_placements(rotations, [*pairs, last]) == {12: "only one other photo supports it"}
+
+
+def test_a_pair_turns_as_its_lenses_see_its_matches(tmp_path):
+    """Whatever fundamental matrix the database has: it leaves the rotation open where lenses are unknown."""
+    rng = np.random.default_rng(0)
+    points = rng.uniform([-2, -1, 4], [2, 1, 6], (80, 3))
+    camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_PINHOLE", 700.0, 800, 600)
+    turn = turned(25)
+    pose = pycolmap.Rigid3d(pycolmap.Rotation3d(turn), np.array([-2.0, 0.1, 0.3]))
+    seen = [camera.img_from_cam(points), camera.img_from_cam(points @ turn.T + pose.translation)]
+    ends = np.repeat(np.arange(80, dtype=np.uint32)[:, None], 2, axis=1)
+    with pycolmap.Database.open(tmp_path / "database.db") as db:
+        for number, pixels in enumerate(seen, 1):
+            pixels += rng.normal(0, 0.3, pixels.shape)
+            db.write_camera(
+                pycolmap.Camera.create_from_model_name(number, "SIMPLE_PINHOLE", 960.0, 800, 600), True
+            )
+            db.write_image(pycolmap.Image(f"{number}.jpg", np.zeros((0, 2)), number, number), True)
+            db.write_keypoints(number, pixels.astype(np.float32))
+        wrong = pycolmap.TwoViewGeometry(config=3, F=rng.normal(size=(3, 3)), inlier_matches=ends)
+        db.write_two_view_geometry(1, 2, wrong)
+        (pair,) = matched_pairs(db, {1: camera, 2: camera})
+    assert pair.matches > 70
+    assert np.degrees(Rotation.from_matrix(pair.turn @ turn.T).magnitude()) < 2
