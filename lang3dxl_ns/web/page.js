@@ -224,6 +224,7 @@ function dragThreshold(prompt, value) {
 function setThreshold(prompt, value) {
   dragThreshold(prompt, value);
   Object.assign(prompt, { dragged: false, finding: null, views: null, box: null, turn: {} });
+  quiet(); // what was told of the view counted the matches of before
   draw();
 }
 

@@ -181,6 +181,22 @@ def test_a_dragged_threshold_is_followed_at_once(page):
 
 
 @pytest.mark.slow
+def test_no_match_is_left_nothing_to_fly_to_and_no_word_of_the_earlier_view(page):
+    page.evaluate("lang3dxl.ask('dome').then(() => true)")
+    until(page, "document.querySelector('.fly').disabled", False)
+    page.evaluate("document.querySelector('.fly').click()")
+    until_told(page, "#status", "View 1 of")
+    page.evaluate("""() => {
+      const slider = document.querySelector("#prompts input[type=range]");
+      slider.value = 1;
+      for (const kind of ["input", "change"]) slider.dispatchEvent(new Event(kind, { bubbles: true }));
+    }""")
+    until(page, "document.getElementById('status').textContent.includes('View 1 of')", False)
+    until(page, "lang3dxl.prompts[0].views?.some((view) => view.shown)", False)
+    until(page, "document.querySelector('.fly').disabled")
+
+
+@pytest.mark.slow
 def test_the_same_prompt_asked_twice_at_once_has_one_card(page):
     page.evaluate("Promise.all(['dome', 'dome', 'windows'].map((text) => lang3dxl.ask(text)))")
     assert prompts_of(page) == ["dome", "windows"]
