@@ -87,7 +87,7 @@ class PerGaussian:
         def relevancy(cosines: Tensor) -> Tensor:
             return queries.relevancy_of_cosines(cosines, self.temperature).T
 
-        return self._of_cosines(relevancy, queries).T * self.known
+        return self.cosines(queries, relevancy).T * self.known
 
     @torch.no_grad()
     def features(self, which: slice | Int[Tensor, " m"]) -> Float[Tensor, "m c"]:
@@ -96,18 +96,14 @@ class PerGaussian:
         return rows if self.head is None else rows @ self.head
 
     @torch.no_grad()
-    def cosines(self, queries: Queries) -> Float[Tensor, "n v"]:
-        """Compute the cosine of every Gaussian with every vector; 0 where unknown."""
-        return self._of_cosines(lambda cosines: cosines, queries)
-
-    def _of_cosines(
-        self, work: Callable[[Float[Tensor, "m v"]], Float[Tensor, "m k"]], queries: Queries
+    def cosines(
+        self, queries: Queries, then: Callable[[Tensor], Tensor] = lambda cosines: cosines
     ) -> Float[Tensor, "n k"]:
-        """Do work on the cosines of a part of the Gaussians at a time. A vector's cosines lie side by side in
-        memory, since relevancy compares one vector's with another's."""
+        """Compute the cosine of every Gaussian with every vector, 0 where unknown, or what `then` makes of
+        them, a part of the Gaussians at a time. Those with one vector lie side by side, for maxima."""
         vectors = queries.vectors if self.head is None else queries.vectors @ self.head.T
         width = max(self.rows.shape[1], len(vectors))
-        return in_chunks(lambda part: work((vectors @ part.float().T).T), self.rows, width, _CHUNK_MB)
+        return in_chunks(lambda part: then((vectors @ part.float().T).T), self.rows, width, _CHUNK_MB)
 
     def calibrated(self, words: Queries) -> PerGaussian:
         """Return this engine with a temperature that suits the encoder (`relevancy.calibrated`), by words

@@ -68,6 +68,9 @@ _ENDINGS = {"JPEG": ".jpg", "MPO": ".jpg", "PNG": ".png", "TIFF": ".tif", "BMP":
 _QUALITY = 98
 _CHUNK_PHOTOS, _CHUNK_PAIRS, _CHUNK_LEARNED = 8, 100, 5  # a step of the bar, which a killed process loses
 _STAMP = "photos.json"
+_POINTS, _POINTS_OF_TWINS = 15, 30
+"""Fewest points that agree on a photo's pose, and fewest where sides look alike, as COLMAP's mapper has it: a
+quarter more photos of a hall get one, but 15 points also agree on the wrong side."""
 _RELAXED = {"init_min_num_inliers": 30, "init_min_tri_angle": 4.0, "abs_pose_min_num_inliers": 15}
 """Thresholds of the incremental mapper where it finds no model with the usual ones."""
 
@@ -188,9 +191,7 @@ def _check_enough(photos: PhotoFolder, good: PhotoFolder, left_out: Mapping[str,
             "(JPEG or PNG), or a video"
         )
     if len(photos.names) == 1:
-        raise UserError(
-            f"{photos.folder} holds one photo: a scene needs at least three, taken from different places"
-        )
+        raise UserError(f"{photos.folder} holds one photo: a scene needs three, from different places")
     name, why = next(iter(left_out.items()))
     raise UserError(
         f"of the {len(photos.names)} photos in {photos.folder} {len(good.names)} are usable, but a scene "
@@ -306,12 +307,14 @@ def match(
             advance(len(chunk))
 
 
-def _map(database: Path, photos: PhotoFolder, work: Path, kind: str) -> list[pycolmap.Reconstruction]:
+def _map(
+    database: Path, photos: PhotoFolder, work: Path, kind: str, points: int = _POINTS
+) -> list[pycolmap.Reconstruction]:
     """Run the mapper and return the models, largest first. The incremental one may need `_RELAXED`."""
     pycolmap = load_pycolmap()
     settings = {"random_seed": 0, "num_threads": os.cpu_count() or 1}
     least = min(_SMALLEST_MODEL, len(photos.names))
-    for thresholds in ({},) if kind == "global" else ({}, _RELAXED):
+    for thresholds in ({},) if kind == "global" else ({"abs_pose_min_num_inliers": points}, _RELAXED):
         bar = progress("photos with a pose", len(photos.names))
         with TemporaryDirectory(dir=work) as folder, bar as advance:
             if kind == "global":
@@ -340,14 +343,11 @@ def _map_without(
     pairs: Collection[tuple[int, int]], database: Path, photos: PhotoFolder, work: Path, kind: str
 ) -> list[pycolmap.Reconstruction]:
     """Map without some pairs."""
-    say(
-        f"{len(pairs)} pairs of photos contradict others, as on a building that looks alike from several "
-        "sides: mapping anew without them"
-    )
+    say(f"{len(pairs)} pairs contradict others, as where sides look alike: mapping anew without them")
     with TemporaryDirectory(dir=work) as folder:
         consistent = Path(folder) / "database.db"
         copy_without(pairs, database, consistent)
-        return _map(consistent, photos, work, kind)
+        return _map(consistent, photos, work, kind, _POINTS_OF_TWINS)
 
 
 def _publish(models: list[pycolmap.Reconstruction], model: Path) -> None:

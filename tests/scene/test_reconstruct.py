@@ -86,11 +86,19 @@ def test_what_matches_measure_agrees_with_the_model(reconstructed):
 
 
 def test_contradicting_pairs_are_left_out_of_a_second_model(photos, monkeypatch, capsys):
-    """The pair is honest here, so all photos keep a pose by others. The database keeps it."""
+    """The pair is honest here, so all photos keep a pose by others. The database keeps it. More
+    points have to agree in the second model."""
+    asked, mapping = [], pycolmap.incremental_mapping
+
+    def watched(*files, **more):
+        asked.append(files[-1].mapper.abs_pose_min_num_inliers)
+        return mapping(*files, **more)
+
+    monkeypatch.setattr(pycolmap, "incremental_mapping", watched)
     monkeypatch.setattr(module, "contradictions", lambda database, known: {(1, 7)})
     report = reconstruct(find_photos(photos), photos / "work", photos / "sparse", SIFT)
     assert "mapping anew without them" in capsys.readouterr().out
-    assert (report.registered, report.contradicting) == (7, 1)
+    assert (report.registered, report.contradicting, asked) == (7, 1, [15, 30])
     assert not list((photos / "work").glob("tmp*"))
 
 
