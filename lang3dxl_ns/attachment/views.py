@@ -25,7 +25,7 @@ from lang3dxl_ns.query.match import as_bytes, save_picture
 from lang3dxl_ns.query.visibility import fingerprint
 from lang3dxl_ns.rendering import Rendering, Splats, composite, render
 from lang3dxl_ns.rendering.gathering import filled_pixels
-from lang3dxl_ns.scene.camera import Camera, Lens, level, looking, resized, seen_from
+from lang3dxl_ns.scene.camera import Camera, Lens, in_camera_frame, level, looking, resized
 from lang3dxl_ns.scene.capture import Capture
 from lang3dxl_ns.scene.colmap import Reconstruction, TrackedPhoto
 from lang3dxl_ns.scene.photo import Photo
@@ -217,7 +217,7 @@ def _judged(splats: Splats, camera: Camera, extent: Extent) -> tuple[Float[Tenso
     seen = pixels > 0.1
     if not seen.any():
         return None
-    depth = seen_from(camera, splats.means[seen])[:, 2].clamp_min(1e-6)
+    depth = in_camera_frame(camera, splats.means[seen])[:, 2].clamp_min(1e-6)
     return pixels, float((splats.scales[seen].amax(1) * LENS.fx / depth).median())
 
 

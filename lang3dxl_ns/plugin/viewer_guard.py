@@ -50,7 +50,10 @@ def guard_viewers() -> None:
     async def guarded_consume(websocket: Any, *rest: Any) -> None:
         try:
             await consume(websocket, *rest)
-        except Exception:  # the end of the connection, or no message of viser's page
+        except websockets.exceptions.ConnectionClosed:
+            raise
+        except Exception as error:  # viser lets anything through, and would answer this client no more
+            say(f"a viewer was disconnected, since its message is none of the page's ({error!r:.80})")
             await websocket.close(1007)
             await websocket.recv()  # raises what viser takes for the end of a connection
 

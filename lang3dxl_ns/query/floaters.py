@@ -15,7 +15,7 @@ from torch import Tensor
 
 from lang3dxl_ns.query.visibility import VisibleGaussians
 from lang3dxl_ns.rendering import Rendering, Splats
-from lang3dxl_ns.scene.camera import Camera, resized, seen_from
+from lang3dxl_ns.scene.camera import Camera, in_camera_frame, resized
 
 FLOATS = 0.5
 """Score above which a Gaussian counts as a floater."""
@@ -55,7 +55,7 @@ def floating(
 
 def _in_view(splats: Splats, camera: Camera, rendering: Rendering) -> tuple[Tensor, Tensor, Tensor]:
     """Return the rows of Gaussians with centers in a view, their depths, and the depths rendered there."""
-    places = seen_from(camera, splats.means)
+    places = in_camera_frame(camera, splats.means)
     (fx, _, cx), (_, fy, cy), _ = camera.intrinsics.tolist()
     x, y = fx * places[:, 0] / places[:, 2] + cx, fy * places[:, 1] / places[:, 2] + cy
     inside = (places[:, 2] > 0.01) & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lang3dxl_ns.query.visibility import VisibleGaussians
-from lang3dxl_ns.scene.camera import Camera, seen_from
+from lang3dxl_ns.scene.camera import Camera, in_camera_frame
 
 OUTLIERS = 0.02
 """Share of a match's points that its box excludes at either end of each axis."""
@@ -186,7 +186,7 @@ def _peak(view: VisibleGaussians, scores: Float[Tensor, " n"]) -> Float[Tensor, 
 def _centeredness(view: VisibleGaussians, means: Float[Tensor, "n 3"]) -> Float[Tensor, " m"]:
     """Compute weights of 1 for Gaussians in the middle half of a view, falling to `RIM` at its rim."""
     camera = view.camera
-    points = seen_from(camera, means[view.rows])
+    points = in_camera_frame(camera, means[view.rows])
     (fx, _, cx), (_, fy, cy), _ = camera.intrinsics.tolist()
     x, y = (points[:, axis] / points[:, 2] for axis in (0, 1))
     off = torch.maximum(

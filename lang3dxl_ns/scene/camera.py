@@ -207,7 +207,7 @@ def camera_to_world(view_matrix: Float[Tensor, "4 4"]) -> Float[Tensor, "3 4"]:
     return torch.cat([rotation * view_matrix.new_tensor([1.0, -1.0, -1.0]), position], dim=1)
 
 
-def seen_from(camera: Camera, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+def in_camera_frame(camera: Camera, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
     """Return points of the world in a camera's frame (OpenCV axes)."""
     view = to_device(camera.view_matrix.to(points.dtype), points.device)
     return points @ view[:3, :3].T + view[:3, 3]
@@ -217,7 +217,7 @@ def seen_from(camera: Camera, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 
 def in_view(camera: Camera, means: Float[Tensor, "n 3"], scales: Float[Tensor, "n 3"]) -> Bool[Tensor, " n"]:
     """Return which Gaussians may be visible: all that are, and some that aren't. The ball of 3.5 standard
     deviations around each is tested against the planes through the image's edges."""
-    points = seen_from(camera, means)
+    points = in_camera_frame(camera, means)
     reach = 3.5 * scales.amax(dim=1)
     seen = points[:, 2] > 0
     margin = 8  # pixels: the rasterizer blurs every splat by one or two

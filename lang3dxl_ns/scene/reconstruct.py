@@ -43,6 +43,7 @@ from lang3dxl_ns.scene.photo_folder import (
 )
 from lang3dxl_ns.scene.placements import (
     LEAST_MATCHES,
+    MatchedPair,
     cameras_of,
     doubtful_placements,
     matched_pairs,
@@ -98,15 +99,18 @@ def reconstruct(
             match(database, copies.names, settings)
         with timed(spent, "mapping"):
             models = _map(database, copies, work, settings.mapper)
-            contradicting = contradictions(database, cameras_of(models[0])) if models else set()
+            pairs = _measured_pairs(database, models[0]) if models else []
+            contradicting = contradictions(pairs)
             if contradicting:
                 models = _map_without(contradicting, database, copies, work, settings.mapper) or models
+                pairs = _measured_pairs(database, models[0])
     features, partners = _features_and_partners(database)
     if not models:
         raise UserError(_why_no_model(features, partners))
     best, names = models[0], dict(zip(copies.names, good.names, strict=True))
     reasons = _reasons(copies.names, models, features, partners)
-    doubts = _doubts(database, best)
+    placed = rotations_of(best)
+    doubts = doubtful_placements(placed, (p for p in pairs if p.first in placed and p.second in placed))
     doubtful = {names[best.images[i].name]: why for i, why in sorted(doubts.items())}
     for image in (image for model in models for image in model.images.values()):
         image.name = names[image.name]
@@ -333,10 +337,11 @@ def _map(
     return sorted(models, key=lambda model: -model.num_reg_images())
 
 
-def _doubts(database: Path, model: pycolmap.Reconstruction) -> dict[int, str]:
-    """Find a model's doubtful photos by number, with reasons."""
+def _measured_pairs(database: Path, model: pycolmap.Reconstruction) -> list[MatchedPair]:
+    """Measure the rotations of all matched pairs, by the model's cameras where it has them."""
     with load_pycolmap().Database.open(database) as db:
-        return doubtful_placements(rotations_of(model), matched_pairs(db, cameras_of(model)))
+        guessed = {image.image_id: db.read_camera(image.camera_id) for image in db.read_all_images()}
+        return matched_pairs(db, guessed | cameras_of(model))
 
 
 def _map_without(

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import sqlite3
 from collections import defaultdict
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,10 +22,10 @@ from numpy import ndarray as Array
 from scipy.spatial.transform import Rotation
 
 from lang3dxl_ns.scene.colmap import load_pycolmap
-from lang3dxl_ns.scene.placements import MatchedPair, matched_pairs
+from lang3dxl_ns.scene.placements import MatchedPair
 
 if TYPE_CHECKING:
-    import pycolmap
+    pass
 
 APART = 40.0
 """Degrees between a pair's rotation and its group's from which the pair contradicts the group. Focal lengths
@@ -60,17 +60,9 @@ class _Groups:
             self.rotation[photo] = self.rotation[photo] @ turn.T
 
 
-def contradictions(database: Path, known: Mapping[int, pycolmap.Camera]) -> set[tuple[int, int]]:
-    """Find the pairs of photos in COLMAP's database whose rotations contradict others; none if their matches
-    are few, as on buildings without symmetry.
-
-    Args:
-        known: cameras of an earlier model, by the photos' numbers, whose focal lengths are better than the
-            database's guesses.
-    """
-    with load_pycolmap().Database.open(database) as db:
-        cameras = {image.image_id: db.read_camera(image.camera_id) for image in db.read_all_images()}
-        pairs = matched_pairs(db, cameras | dict(known))
+def contradictions(pairs: Sequence[MatchedPair]) -> set[tuple[int, int]]:
+    """Find the pairs whose rotations contradict others; none if their matches are few, as on buildings
+    without symmetry. The cameras of a first model measure rotations better than a database's guesses."""
     found = contradicting_pairs(pairs)
     matches = sum(pair.matches for pair in pairs if (pair.first, pair.second) in found)
     return found if matches > SYMMETRIC * sum(pair.matches for pair in pairs) else set()

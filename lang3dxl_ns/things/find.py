@@ -17,7 +17,7 @@ from lang3dxl_ns.query.doubt import peaks
 from lang3dxl_ns.query.question import Question
 from lang3dxl_ns.query.trust import FAR
 from lang3dxl_ns.rendering import composite
-from lang3dxl_ns.scene.camera import seen_from
+from lang3dxl_ns.scene.camera import in_camera_frame
 from lang3dxl_ns.things.join import VIEWS, Joined, grown, join, stacked, without_crumbs
 from lang3dxl_ns.things.pieces import FILLED, LEVELS, Piece, Shown, pieces_of
 from lang3dxl_ns.things.thing import Box, Sighting, Thing, upright_box
@@ -161,7 +161,7 @@ def _views(scene: Answering, heat: Float[Tensor, "n q"]) -> Iterator[list[Shown]
     for name, view in scene.visible.items():
         photo = scene.file.photo(name)
         camera = photo.camera
-        seen = seen_from(camera, means)
+        seen = in_camera_frame(camera, means)
         lit = torch.cat([heat.to(means), torch.ones_like(seen[:, 2:])], 1)
         drawn = composite(splats, camera, torch.cat([lit, lit * seen[:, 2:]], 1))
         maps, depths = np.split(np.moveaxis(drawn.cpu().numpy(), 2, 0), 2)

@@ -60,10 +60,8 @@ def learn_words(run: Training, data: TrainingData) -> None:
     """Give a run's Gaussians codes that represent the targets of its photos; see `learn_codes`."""
     semantics, facts = run.parts.semantics, run.facts
     assert semantics is not None and facts.clip_targets is not None
-    views, means = (
-        (_target_view(run, *photo) for photo in data.every_photo()),
-        run.gaussians["means"].detach(),
-    )
+    views = (_target_view(run, *photo) for photo in data.every_photo())
+    means = run.gaussians["means"].detach()
     # Initial codes are fitted to the unsharpened targets, which the loss compares with.
     dense = None if run.learns_from_renderings else facts.dense_targets
     codes = learn_codes(semantics.decoder, views, len(data.cameras), means, facts.clip_targets, dense)

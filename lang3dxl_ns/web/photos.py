@@ -13,7 +13,7 @@ from PIL import Image
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.query.visibility import spread
-from lang3dxl_ns.scene.camera import seen_from
+from lang3dxl_ns.scene.camera import in_camera_frame
 from lang3dxl_ns.scene.photo_folder import find_photos
 from lang3dxl_ns.scene.record import SCENE_FILE, ScenePhoto, SceneRecord
 from lang3dxl_ns.web.pack import camera_json
@@ -78,7 +78,7 @@ def extent(scene: Scene) -> list[float]:
     (fx, _, cx), (_, fy, cy), _ = camera.intrinsics.tolist()
     own = [-cx / fx, -cy / fy, (camera.width - cx) / fx, (camera.height - cy) / fy]
     sound, mass = scene.splats.sound(), scene.mass
-    places = torch.where(sound[:, None], seen_from(camera, scene.splats.means), 0.0)
+    places = torch.where(sound[:, None], in_camera_frame(camera, scene.splats.means), 0.0)
     middle = float(places[:, 2][sound].median()) if len(places) else 0.0
     # The sky and distant surroundings lie far behind, and what stands before the landmark hides less of it.
     known, sizes = mass > 0, scene.splats.scales.amax(1)

@@ -364,7 +364,6 @@ def write_page(page: Page, folder: Path) -> int:
     ours = index.is_file() and "<title>A scene to ask</title>" in index.read_text(errors="replace")
     names, other = {*own, "scene.json", "vocabulary.json"}, (".bin", *PHOTO_SUFFIXES)
     here = sorted(folder.iterdir())
-    names = {*own, "scene.json", "vocabulary.json"}
     taken = [path.name for path in here if path.name in names or path.suffix.lower() in other]
     if taken and not ours:  # whoever serves a folder of photos would publish them
         raise UserError(f"{folder} holds {taken[0]}, which is not a scene's page: name a folder of its own")
