@@ -330,14 +330,8 @@ class Scene:
     @cached_property
     def visible(self) -> Mapping[str, VisibleGaussians]:
         """The Gaussians visible in each training view. They are measured once, with a progress bar."""
-        return measured(
-            self.file,
-            self.splats,
-            self.config.views,
-            self.config.view_side,
-            cache=self.cache,
-            watch=self.watch,
-        )
+        size = self.config.views, self.config.view_side
+        return measured(self.file, self.splats, *size, cache=self.cache, watch=self.watch)
 
     @cached_property
     def mass(self) -> Float[Tensor, " n"]:

@@ -46,9 +46,7 @@ def write_catalog(scene: Scene, answers: Sequence[Things], folder: Path) -> None
     rows = io.StringIO()
     table = csv.writer(rows, lineterminator="\n")
     sides = ["width", "depth", "height"]
-    table.writerow(
-        ["id", "word", "score", "views", *"xyz", *sides, "photo", *(f"{side}_m" for side in sides)]
-    )
+    table.writerow(["id", "word", "score", "views", *"xyz", *sides, "photo", *(f"{s}_m" for s in sides)])
     for thing, size in zip(things, meters, strict=True):
         seen = thing.sightings[0].photo if thing.sightings else ""
         numbers = [*thing.center.round(4).tolist(), *thing.size.round(4).tolist(), seen, *(size or [""] * 3)]
@@ -127,8 +125,5 @@ def write_things(scene: Scene, answers: Sequence[Things], folder: Path, look: st
 
 
 def _each_once(answers: Sequence[Things]) -> list[Thing]:
-    things: dict[int, Thing] = {}
-    for one in answers:
-        for thing in one.things:
-            things.setdefault(thing.id, thing)
-    return list(things.values())
+    things = [thing for one in answers for thing in one.things]
+    return list({thing.id: thing for thing in reversed(things)}.values())[::-1]

@@ -134,13 +134,22 @@ def test_pieces_join_as_in_python(page):
             rows = np.unique(rng.integers(start, min(start + wide, 200), 30))
             cut = bool(rng.random() < 0.1)
             pieces.append(Piece(str(view), rows, float(rng.random()), len(rows), (0, 0, 1, 1), cut))
-    weight = rng.random(200)
-    expected = grown(without_crumbs(join(pieces, weight)), 200)
+    weight, points = rng.random(200), rng.random((200, 3))
+
+    def box(one: Joined):
+        return upright_box(points[one.rows], weight[one.rows], np.eye(3))
+
+    points[:, 0] += np.arange(200) / 20
+    expected = grown(without_crumbs(join(pieces, weight, box)), 200)
     given = [{"view": int(p.photo), "rows": p.rows.tolist(), "resolution": p.resolution, "cut": p.cut}
              for p in pieces]  # fmt: skip
-    body = """return m.grown(m.withoutCrumbs(m.join(given.pieces, given.weight)), 200).map(
+    body = """const edges = [[1, 0, 0], [0, 1, 0], [0, 0, 1]];
+      const box = ({ rows }) => m.uprightBox(rows, given.points, given.weight, edges);
+      return m.grown(m.withoutCrumbs(m.join(given.pieces, given.weight, box)), 200).map(
       ({ rows, votes }) => [rows.toSorted((a, b) => a - b), new Set(votes.map(({ view }) => view)).size]);"""
-    found = module(page, "things", body, {"pieces": given, "weight": weight.tolist()})
+    found = module(
+        page, "things", body, {"pieces": given, "weight": weight.tolist(), "points": points.ravel().tolist()}
+    )
     assert len(found) > 5
     assert sorted(found) == sorted([sorted(one.rows.tolist()), one.views] for one in expected)
 
