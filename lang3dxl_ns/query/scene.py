@@ -321,9 +321,8 @@ class Scene:
         solid = self.floating <= FLOATS if hide_floaters else None
         if text is None:
             return write_splats(path, splats if solid is None else splats.select(solid), place=place)
-        return write_matching(
-            path, splats, asking.ask_one(self, text, threshold), everything, index, solid, place
-        )
+        question = asking.ask_one(self, text, threshold)
+        return write_matching(path, splats, question, everything, index, solid, place)
 
     # ── what the photos show ────────────────────────────────────────────────────────────────────────
 

@@ -77,8 +77,7 @@ def things_of(scene: Answering, question: Question) -> list[Things]:
 
     Every training view's heat map falls into pieces (`pieces_of`), and pieces of several views are one thing
     where they share Gaussians (`join`). Where a prompt's colors differ from those around it, colors separate
-    neighbors: the wall between two windows that CLIP sees as one. A thing that an earlier question to this
-    scene found keeps its id.
+    neighbors: the wall between two windows that CLIP sees as one. A thing keeps its id in later questions.
     """
     mass = scene.mass.double().cpu().numpy()
     means, axes = scene.splats.means.double().cpu().numpy(), axes_of(scene)

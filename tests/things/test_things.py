@@ -15,13 +15,14 @@ from lab.landmark.instances import true_things
 from lab.landmark.landmark import Landmark
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.query.trust import FAR
+from lang3dxl_ns.rendering import Camera, Rendering
 from lang3dxl_ns.scene.georeference import Georeference
 from lang3dxl_ns.things.find import Things, axes_of, up_of
 from lang3dxl_ns.things.grammar import Request, Sight, answer, parse, sight_of, table, unsure
 from lang3dxl_ns.things.join import OFTEN, Joined, grown, join, stacked, without_crumbs
 from lang3dxl_ns.things.pieces import Piece, Shown, pieces_of, split
 from lang3dxl_ns.things.thing import Thing, upright_box
-from lang3dxl_ns.things.write import write_catalog
+from lang3dxl_ns.things.write import outlined, write_catalog
 
 SIGHT = Sight(np.array([1.0, 0, 0]), np.array([0, 0, 1.0]), np.array([0, 1.0, 0]))
 
@@ -265,6 +266,20 @@ def test_the_catalog_names_the_nearest_neighbors_and_what_is_in_what(tmp_path):
     assert [1, other, 0] in graph
     assert [0, side, 2] not in graph  # the one between is nearer
     assert [1, side, 2] in graph
+
+
+def test_outlines_are_drawn_around_what_a_view_shows_and_not_around_what_it_hides():
+    camera = Camera(torch.eye(4), torch.tensor([[50.0, 0, 50], [0, 50.0, 40], [0, 0, 1]]), 100, 80)
+    wall = Rendering(camera, torch.full((80, 100, 3), 0.5), torch.ones(80, 100), torch.full((80, 100), 5.0))
+    shown = thing(1, "window", (1, 0, 5), (1.0, 2.0, 0.2))
+    others = [thing(2, "window", (-2, 0, 7)), thing(3, "window", (0, 0, -5)), thing(4, "window", (9, 0, 5))]
+    plain = outlined(wall, [])
+    assert (plain == 128).all()
+    assert (outlined(wall, [Things("window", others)]) == plain).all()  # behind the wall, behind us, aside
+    rows, columns = (outlined(wall, [Things("window", [shown, *others])]) != plain).any(2).nonzero()
+    # Its front side is 4.9 away: 10.2 by 20.4 pixels around column 60 and row 40.
+    assert [columns.min(), columns.max()] == pytest.approx([55, 65], abs=1.5)
+    assert [rows.min(), rows.max()] == pytest.approx([29.8, 50.2], abs=1.5)
 
 
 @pytest.mark.parametrize("known", [True, False])
