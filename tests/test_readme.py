@@ -1,4 +1,4 @@
-"""The README's commands and snippets, run as printed, on the demo's quick run."""
+"""The README's commands and snippets, run as printed, on a small run of the demo."""
 
 import json
 import re
@@ -31,7 +31,8 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def demo_output(folder) -> str:
-    return output("lang3dxl", "demo", "--quick", cwd=folder, shell=True, timeout=1800)
+    few = ("--photos", 16, "--test-views", 4)
+    return output("lang3dxl", "demo", "--quick", *few, cwd=folder, shell=True, timeout=1800)
 
 
 def test_the_quick_demo_finds_words_in_photos_that_it_has_never_seen(demo_output, folder):
