@@ -33,7 +33,7 @@ def folder(tmp_path_factory):
 @pytest.fixture(scope="module")
 def demo_output(folder) -> str:
     few = ("--photos", 16, "--test-views", 4)
-    return output("lang3dxl", "demo", "--quick", *few, cwd=folder, timeout=1800)
+    return output("lang3dxl", "demo", "--quick", *few, cwd=folder, shell=True, timeout=1800)
 
 
 def test_the_quick_demo_finds_words_in_photos_that_it_has_never_seen(demo_output, folder):
