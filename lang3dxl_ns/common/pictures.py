@@ -152,8 +152,7 @@ def mask_values(image: Image.Image) -> Image.Image:
 
     Gray masks are taken as they are, unless they hold only 0 and 1, as NumPy's do: 1 then marks the
     foreground. In masks with colors, as segmenters paint them, black is the background: colors of a palette
-    mark the foreground, and in other pictures the brightest channel counts. Of cut-outs, what is opaque
-    marks it.
+    mark the foreground, and in other pictures the brightest channel counts. Cut-outs are opaque there.
     """
     if image.has_transparency_data and _is_cut_out(image):
         return opacity(image)

@@ -9,6 +9,7 @@ import json
 import re
 import struct
 from collections.abc import Iterator, Sequence
+from io import BytesIO
 from math import isqrt
 from pathlib import Path
 from typing import Any
@@ -23,11 +24,13 @@ from lang3dxl_ns.common.checks import expect
 from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.files.activations import ALL_BANDS, array_of, check_memory, tensor_of
+from lang3dxl_ns.files.spz import decode_spz
 from lang3dxl_ns.rendering import Splats
 from lang3dxl_ns.scene.georeference import Georeference
 from lang3dxl_ns.things.thing import Thing
 
 _SPLATS, _RECORD = "KHR_gaussian_splatting", "LANG3DXL_scene"
+_SPZ = "KHR_gaussian_splatting_compression_spz"  # _2 and what follows: drafts, so they are read alone
 _FEATURES, _METADATA = "EXT_mesh_features", "EXT_structural_metadata"
 _HEADER, _CHUNK = struct.Struct("<4sII"), struct.Struct("<I4s")
 _FLOAT, _POINTS, _ARRAY_BUFFER = 5126, 0, 34962
@@ -198,7 +201,7 @@ class _Glb:
 
 def read_glb(path: Path) -> Splats:
     """Read the first splats of a file, in the frame of their own node. Raises UserError if it has none, or
-    they are compressed, and one of `DAMAGE` for a damaged file."""
+    they are compressed otherwise than as SPZ, and one of `DAMAGE` for a damaged file."""
     file = _Glb(path)
     meshes = (primitive for mesh in file.about.get("meshes", []) for primitive in mesh["primitives"])
     splats = [one for one in meshes if _SPLATS in one.get("extensions", {})]
@@ -207,24 +210,23 @@ def read_glb(path: Path) -> Splats:
     if len(splats) > 1:
         say(f"{path} holds {len(splats)} splats, of which the first is read: join them in a splat editor")
     named = (found := splats[0])["attributes"]
-    if _harmonic(0) not in named:
-        raise UserError("its splats have no harmonics, only colors of points: export it as a splat")
-    if found["extensions"][_SPLATS].get("extensions"):
-        raise UserError("its splats are compressed by another extension: export them without compression")
+    for name, about in (found["extensions"][_SPLATS].get("extensions") or {}).items():
+        if not name.startswith(_SPZ):
+            raise UserError(f"its splats are compressed by {name}: export them without compression")
+        return decode_spz(BytesIO(file.view(about["bufferView"])))
+    if f"{_SPLATS}:SCALE" not in named or _harmonic(0) not in named:
+        raise UserError(f"its attributes are those of points, or of a draft of {_SPLATS}: export it anew")
     degree = max(d for d in range(_MOST_DEGREE + 1) if _harmonic(d**2) in named)
     check_memory(file.about["accessors"][named["POSITION"]]["count"], ALL_BANDS)
-    parts = [file.values(named[name], 3) for name in ("POSITION", f"{_SPLATS}:SCALE")]
+    means, scales = (tensor_of(file.values(named[name], 3)) for name in ("POSITION", f"{_SPLATS}:SCALE"))
     quats = np.roll(file.values(named[f"{_SPLATS}:ROTATION"], 4), 1, axis=1)
     opacities = file.values(named[f"{_SPLATS}:OPACITY"], 1)[:, 0]
     harmonics = np.stack(
         [file.values(named[_harmonic(band)], 3) for band in range((degree + 1) ** 2)], axis=1
     )
-    expect(
-        {len(part) for part in (*parts, quats, opacities)} == {len(harmonics)},
-        "its attributes differ in size",
-    )
+    sizes = {len(means), len(quats), len(scales), len(opacities), len(harmonics)}
+    expect(len(sizes) == 1, "its attributes differ in size")
     antialiased = bool((found.get("extras") or {}).get("antialiased", False))
-    means, scales = map(tensor_of, parts)
     scales = scales.exp() if (scales < 0).any() else scales  # splat-transform wrote logarithms until 2026
     return Splats(means, tensor_of(quats), scales, tensor_of(opacities), tensor_of(harmonics), antialiased)
 

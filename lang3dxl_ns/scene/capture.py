@@ -145,9 +145,8 @@ class Capture:
 
     def _named(self, path: Path) -> frozenset[str]:
         """Read a list of photos. Raises UserError for an unknown one."""
-        names = read_names(path)
         with readable(f"{path} can't be used", "correct the list"):
-            return listed(names, {*self.names, *self.left_out}, "it")
+            return listed(read_names(path), {*self.names, *self.left_out}, "it")
 
     def _split_by_rule(self) -> Split:
         if self.settings.eval_mode == "all":
@@ -306,8 +305,7 @@ def _usable(
             kept[file] = turned
         except UserError as reason:
             left_out[name] = str(reason)
-    cut_out = [photo.name for photo in photos if photo.mask_path == photo.path]
-    if cut_out:
+    if cut_out := [photo.name for photo in photos if photo.mask_path == photo.path]:
         say(f"{len(cut_out)} photos have transparent parts, which do not count: {some(cut_out, 3)}")
     unmasked = photos and all(photo.mask_path in (None, photo.path) for photo in photos)
     if masks is not None and unmasked and any(masks.folder.iterdir()):

@@ -12,7 +12,7 @@ from typing import get_args
 import pytest
 import tyro
 
-from lang3dxl_ns.common.settings_help import asked_for_all, showing
+from lang3dxl_ns.common.settings_help import asked_for_all, showing, without
 
 
 def options(kind, default=None) -> set[str]:
@@ -40,6 +40,14 @@ def test_what_few_need_is_left_out_of_the_help_alone(monkeypatch):
         assert options(settings()) == {"--often", "--rarely"}
     assert tyro.cli(settings(), args=["--rarely", "3"]).rarely == 3
     assert asked_for_all(["demo", "--help-all"]) == ["demo", "--help"]
+
+
+def test_a_setting_that_is_taken_off_is_neither_listed_nor_accepted(monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["lang3dxl", "train", "--help-all"])
+    kind = without("rarely")(settings())
+    assert options(kind) == {"--often"}
+    with pytest.raises(SystemExit):
+        tyro.cli(kind, args=["--rarely", "3"])
 
 
 def test_the_help_has_the_settings_in_order_and_names_their_kind_alone(monkeypatch, capsys):
