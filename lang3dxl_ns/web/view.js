@@ -28,7 +28,6 @@ export class View extends EventTarget {
     this.mover.addEventListener("release", () => (this.held = false));
     new ResizeObserver(() => this.resize()).observe(frame);
     this.resize();
-    this.mover.place(this.mover.overviewStand());
     this.listen();
   }
 
@@ -40,6 +39,7 @@ export class View extends EventTarget {
     this.scene.add(root.mesh);
     this.root = root;
     this.parts.set(0, root);
+    this.mover.place(this.mover.overviewStand()); // now that the page's strip of photos covers its part
     this.recolor();
   }
 
