@@ -55,10 +55,10 @@ def join(pieces: Sequence[Piece], weight: Float[Array, " n"], box: Callable[[Joi
     """Join the pieces of all views, from the finest resolution to the coarsest.
 
     A piece founds a thing if its Gaussians are mostly free, confirms the thing that it shares most with, and
-    says nothing if it covers several things (a coarse view joins neighbors that a fine one tells apart), or
-    if it is cut off and new. A thing is one with the heavier one that most photos cover together with it
-    (two sides of a tower), unless a photo shows each alone, or shows both in two pieces and neither stands
-    over the other (a spire and a pinnacle). `weight`: of each Gaussian, 0 and above; `box`: of a thing.
+    says nothing if it covers several things, which a finer view told apart, or if it is cut off and new. A
+    thing is one with the heavier one that most photos cover together with it (two sides of a tower), unless a
+    photo shows each alone, or shows both in two pieces and neither stands over the other (a spire and a
+    pinnacle). `weight`: of each Gaussian, 0 and above; `box`: of a thing.
     """
     owner, things = np.full(len(weight), -1), list[Joined]()
     seen = defaultdict[tuple[int, ...], set[str]](

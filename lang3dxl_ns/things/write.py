@@ -107,8 +107,7 @@ def write_picture(scene: Scene, answers: Sequence[Things], path: Path) -> None:
 
 
 def outlined(rendering: Rendering, answers: Sequence[Things]) -> UInt8[Array, "h w 3"]:
-    """Draw the outline of each thing's box, numbered within its word and in the word's color. Things behind
-    what the view shows, by more than their own size, are left out."""
+    """Draw each thing's box in its word's color, numbered, unless it lies over its size behind the view."""
     picture, camera = Image.fromarray(as_bytes(rendering.rgb)), rendering.camera
     pen, lens, depth = ImageDraw.Draw(picture), camera.intrinsics.cpu().numpy(), rendering.depth.cpu().numpy()
     numbered = [(i, n, thing) for i, one in enumerate(answers) for n, thing in enumerate(one.things, 1)]
