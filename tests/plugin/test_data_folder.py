@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from PIL import Image
 from scenes import speckled, write_scene
@@ -122,6 +123,13 @@ def test_a_folder_with_transforms_is_read_in_nerfstudios_frame_and_split(tmp_pat
         assert a.dataparser_scale == pytest.approx(b.dataparser_scale)
     manager = datamanager(data)
     assert len(manager.train_dataset) + len(manager.eval_dataset) == 12
+
+
+def test_nerfstudios_other_readers_are_refused_with_the_way_out(tmp_path):
+    with pytest.raises(
+        UserError, match="BlenderDataParserConfig is not read here: leave the dataparser's name"
+    ):
+        parser_for(BlenderDataParserConfig(data=write_transforms(tmp_path / "data")), None, True)
 
 
 def make_video(photos, path):
