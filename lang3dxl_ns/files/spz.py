@@ -48,6 +48,7 @@ def decode_spz(file: BinaryIO) -> Splats:
         if degree > _HIGHEST_DEGREE:
             raise UserError(f"its harmonics have degree {degree}; 0 to 4 can be read: export it anew")
         expect(bits <= 24, f"its coordinates have {bits} fractional bits")
+        expect(count > 0, "it holds no Gaussian")
         check_memory(count, ALL_BANDS)
         sides = _sides(version, degree)
         if version < 4:
@@ -86,7 +87,7 @@ def _opened(file: BinaryIO) -> Iterator[tuple[Any, ...]]:
         expect(len(head) == _HEADER.size, "its header is cut short")
         magic, version, *numbers = _HEADER.unpack(head)
         expect(magic == _MAGIC, "it doesn't begin like an SPZ")
-        if version != 4 if not packed else not 1 <= version <= 3:
+        if not 1 <= version <= 4:
             raise UserError(f"it is SPZ of version {version}; 1 to 4 can be read: save it as one of them")
         yield stream, version, *numbers
 

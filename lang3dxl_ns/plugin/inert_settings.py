@@ -29,7 +29,7 @@ OF_IMAGE_CACHES = (
 photos replace here."""
 OF_COLMAP = (
     *("downscale_rounding_mode", "depths_path", "depth_unit_scale_factor", "max_2D_matches_per_3D_point"),
-    "load_3D_points",
+    *("load_3D_points", "train_split_fraction"),
 )
 """Settings of nerfstudio's COLMAP reader; this package's reads points always, and depths never."""
 _OF_RENDERINGS = (
