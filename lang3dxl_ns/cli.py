@@ -26,13 +26,13 @@ from lang3dxl_ns.common.errors import NO_NERFSTUDIO, UserError, misses_nerfstudi
 from lang3dxl_ns.common.files import expanded
 from lang3dxl_ns.common.memory import ran_out_of_memory
 from lang3dxl_ns.common.settings_help import asked_for_all
+from lang3dxl_ns.common.stopping import end_at_once
 
 LAB = Path(__file__).parents[1] / "lab"
 BENCHMARKS = {
     "ablation": ("lab.benchmarks.ablation:Ablation", "The method, baselines, and ablations."),
     "training": ("lab.benchmarks.training:TrainingBenchmark", "A training step by its parts."),
     "gpu": ("lab.benchmarks.gpu:GpuBenchmark", "A GPU: parity, numerics, time, memory, in one file to send."),
-    "scale": ("lab.benchmarks.scale:ScaleBenchmark", "Growing numbers of photos and of Gaussians."),
     "holyscenes": ("lab.benchmarks.published:HolyScenes", "HolyScenes, beside the published figures."),
     "lerf-ovs": ("lab.benchmarks.published:LerfOvs", "LERF-OVS, beside the published figures."),
     "pt-ovs": ("lab.benchmarks.published:PtOvs", "PT-OVS, scene by scene."),
@@ -82,7 +82,7 @@ def main(arguments: list[str] | None = None) -> None:
     except FileNotFoundError:
         sys.exit("Error: the current folder was deleted: change to another one")
     try:
-        with _terminable():
+        with _terminable(ends=arguments is None):
             copy_context().run(_parsed(words).main)  # undoes the command's message settings
             if sys.stdout is not None:  # closed at the start
                 sys.stdout.flush()
@@ -200,8 +200,8 @@ def settings_of(place: str) -> Any:
 
 
 @contextlib.contextmanager
-def _terminable() -> Iterator[None]:
-    """Let SIGTERM stop the command cleanly, like Ctrl-C."""
+def _terminable(ends: bool) -> Iterator[None]:
+    """Let SIGTERM stop the command cleanly, like Ctrl-C. ends: whether the process ends after it."""
     if threading.current_thread() is not threading.main_thread():  # only the main thread may handle signals
         yield
         return
@@ -212,6 +212,8 @@ def _terminable() -> Iterator[None]:
     finally:
         sys.unraisablehook = hook
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        if ends:
+            end_at_once()
 
 
 def _stop_again(ignored: Any) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import sys
 from typing import Literal
 
@@ -10,6 +11,7 @@ from nerfstudio.configs.base_config import LoggingConfig, MachineConfig, ViewerC
 from nerfstudio.plugins.types import MethodSpecification
 
 from lang3dxl_ns.common.settings_help import asked_for_all
+from lang3dxl_ns.common.stopping import end_at_once
 from lang3dxl_ns.plugin.optimizers import parameter_groups
 from lang3dxl_ns.plugin.pipeline import Lang3DXLPipelineConfig
 from lang3dxl_ns.plugin.run_settings import check_command_line
@@ -19,6 +21,7 @@ from lang3dxl_ns.training.learning_rates import Rates, learning_rates, printed_l
 from lang3dxl_ns.training.settings import PRINTED_PHOTO_SCALE, as_printed
 
 check_command_line(sys.argv[1:])
+atexit.register(end_at_once)  # before the handlers of torch, which was imported earlier
 
 DEVICE: Literal["cuda", "cpu"] = "cuda" if torch.cuda.is_available() else "cpu"
 

@@ -11,9 +11,11 @@ import random
 import re
 import shutil
 import signal
+import subprocess
 import time
 from collections import Counter
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -48,6 +50,10 @@ class Case:
     """Scene file that has to open, and to know the word taught earlier, at any moment."""
     resumed: Callable[[Path], tuple[str, ...]] = lambda _: ()
     """Further words with which a user goes on."""
+    changes: tuple[str, ...] = ()
+    """Beginnings of files of the user that the command may change, besides the scene."""
+    serves: str | None = None
+    """What it says once it serves, after which Ctrl-C is its end."""
 
 
 @dataclass
@@ -71,7 +77,8 @@ class Kills:
         lengths, right = dict[str, float](), dict[str, str]()
         for name, case in cases.items():
             begin, folder = time.time(), fresh(out, name)
-            processes.output(*case.words, cwd=folder)
+            done = finished(case, folder)
+            assert done.returncode == 0, done.stdout + done.stderr
             lengths[name], right[name] = time.time() - begin, case.ended(folder)
             print(f"{name}: {lengths[name]:.1f} s undisturbed", flush=True)
         counts, faults = Counter[str](), list[str]()
@@ -112,7 +119,7 @@ def trial(
         if "Traceback" in said or not stopped:
             faults.append(f"{number.name} at {moment:.1f} s: ends with {done.returncode}: {said[-1500:]}")
         faults += [f"{number.name} at {moment:.1f} s: {what}" for what in lost(folder, given, case)]
-    done = processes.run(*case.words, *case.resumed(folder), cwd=folder, timeout=300)
+    done = finished(case, folder)
     try:
         if done.returncode and not re.search(WHOLE, said := done.stdout + done.stderr):
             raise RuntimeError(said[-1500:])
@@ -126,10 +133,24 @@ def trial(
     return faults
 
 
+def finished(case: Case, folder: Path) -> subprocess.CompletedProcess[str]:
+    """Run a command to its end. One that serves is ended by Ctrl-C once it does."""
+    process = processes.start(*case.words, *case.resumed(folder), cwd=folder, new_session=True)
+    said = ""
+    while case.serves and case.serves not in said and process.poll() is None:
+        time.sleep(0.1)
+        with suppress(FileNotFoundError):  # it has only just begun
+            said = process.stdout
+    if case.serves:
+        process.send_signal(signal.SIGINT)
+    return process.wait(300)
+
+
 def lost(folder: Path, given: dict[str, str], case: Case) -> Told:
     """List what is no longer as it was. A scene that may change has to open and to know its word."""
     now = prints(folder)
-    told = [f"{name} changed" for name in given if name != case.keeps and now.get(name) != given[name]]
+    may_change = tuple(filter(None, (case.keeps, *case.changes)))
+    told = [f"{n} changed" for n in given if not n.startswith(may_change) and now.get(n) != given[n]]
     if case.keeps:
         try:
             words = {word.name for word in describe_scene_file(folder / case.keeps)["taught"]}
@@ -162,7 +183,13 @@ def stock(out: Path) -> None:
     scenes.write_scene(base / "data", photos=8, points=120)
     scenes.texture = scenes.speckled
     scenes.write_scene(base / "photos", photos=6, size=(240, 180))
+    shutil.copytree(base / "photos", base / "more")
     shutil.rmtree(base / "photos" / "sparse")
+    (base / "late").mkdir()
+    for name in ("photo_001.jpg", "photo_004.jpg"):
+        shutil.move(base / "more" / "images" / name, base / "late" / name)
+    shutil.rmtree(base / "more" / "sparse")
+    (base / "path.json").write_text(json.dumps(PATH))
     short = ("--out", "run", "--steps", "12", *CLIP)
     for words in (
         ("train", "data", *short),
@@ -170,11 +197,13 @@ def stock(out: Path) -> None:
         ("export", "run", "--out", "splat.ply"),
         ("teach", "castle.scene", "--word", TAUGHT, *TEACH),
         ("export", "run", "--web", "page"),
+        ("reconstruct", "--data", "more"),
     ):
         processes.output("lang3dxl", *words, cwd=base)
     shutil.rmtree(base / "run")
-    for cache in base.rglob("lang3dxl_cache"):
-        shutil.rmtree(cache)
+    for cache in base.glob("*/lang3dxl_cache"):
+        if cache.parent.name != "more":
+            shutil.rmtree(cache)
 
 
 def fresh(out: Path, name: str) -> Path:
@@ -207,9 +236,19 @@ def page(folder: Path) -> str:
     return f"{len(data)} files, {named['splats.bin']}"
 
 
-def model(folder: Path) -> str:
-    found = read_reconstruction(folder / "photos" / "sparse" / "0")
+def model(name: str, folder: Path) -> str:
+    found = read_reconstruction(folder / name / "sparse" / "0")
     return f"{len(found.photos)} photos"
+
+
+def video(folder: Path) -> str:
+    """Count the pictures of a video that ffmpeg reads to its end."""
+    asked = ("-count_frames", "-show_entries", "stream=nb_read_frames", "-of", "csv=p=0")
+    return subprocess.check_output(["ffprobe", "-v", "error", *asked, str(folder / "out.mp4")], text=True)
+
+
+def things(folder: Path) -> str:
+    return digest(folder / "things" / "things.json")
 
 
 def targets(folder: Path) -> str:
@@ -243,6 +282,9 @@ def exported(folder: Path) -> str:
     return str(float(read_splats(folder / "new.ply").means.sum()))
 
 
+_POSE = [1, 0, 0, 0, 0, 0, -1, -4, 0, 1, 0, 0.5, 0, 0, 0, 1]
+_FRAME = {"camera_to_world": _POSE, "fov": 50}
+PATH = {"render_width": 320, "render_height": 240, "camera_path": [_FRAME] * 40}
 _NS = ("ns-train", "lang3dxl", "--data", "data", "--max-num-iterations", "24", "--steps-per-save", "6")
 CASES = {
     "train": Case(
@@ -273,7 +315,26 @@ CASES = {
     "export-splat": Case(
         ("lang3dxl", "export", "castle.scene", "--out", "new.ply"), exported, keeps="castle.scene"
     ),
-    "reconstruct": Case(("lang3dxl", "reconstruct", "--data", "photos"), model),
+    "reconstruct": Case(("lang3dxl", "reconstruct", "--data", "photos"), partial(model, "photos")),
+    "add": Case(
+        ("lang3dxl", "reconstruct", "--data", "more", "--add", "late"),
+        partial(model, "more"),
+        changes=("more/sparse/0/",),
+    ),
+    "things": Case(
+        ("lang3dxl", "things", "castle.scene", "--text", TAUGHT, "--out", "things"), things, "castle.scene"
+    ),
+    "video": Case(
+        ("lang3dxl", "export", "castle.scene", "--video", "out.mp4", "--camera-path", "path.json"),
+        video,
+        keeps="castle.scene",
+    ),
+    "view": Case(
+        ("lang3dxl", "view", "castle.scene"),
+        lambda folder: scene_in("castle.scene", folder, TAUGHT),
+        keeps="castle.scene",
+        serves="Ctrl-C ends it",
+    ),
     "prepare": Case(("lang3dxl", "prepare", "--data", "data", *CLIP), targets),
 }
 

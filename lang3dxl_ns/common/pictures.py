@@ -139,7 +139,12 @@ def gray_values(image: Image.Image, behind: int = 0) -> Image.Image:
     gray = eight_bits(image).convert("L")
     if not image.has_transparency_data:
         return gray
-    return Image.composite(gray, Image.new("L", gray.size, behind), image.convert("RGBA").getchannel("A"))
+    return Image.composite(gray, Image.new("L", gray.size, behind), opacity(image))
+
+
+def opacity(image: Image.Image) -> Image.Image:
+    """Return how opaque an open picture is, 0…255."""
+    return image.convert("RGBA").getchannel("A")
 
 
 def mask_values(image: Image.Image) -> Image.Image:
@@ -147,8 +152,10 @@ def mask_values(image: Image.Image) -> Image.Image:
 
     Gray masks are taken as they are, unless they hold only 0 and 1, as NumPy's do: 1 then marks the
     foreground. In masks with colors, as segmenters paint them, black is the background: colors of a palette
-    mark the foreground, and in other pictures the brightest channel counts.
+    mark the foreground, and in other pictures the brightest channel counts. Cut-outs are opaque there.
     """
+    if image.has_transparency_data and _is_cut_out(image):
+        return opacity(image)
     if not image.has_transparency_data and image.mode in ("P", "RGB"):
         colors = np.asarray(image.convert("RGB"))
         if (colors != colors[..., :1]).any():
@@ -161,6 +168,18 @@ def mask_values(image: Image.Image) -> Image.Image:
     if lossless and gray.getextrema()[1] == 1:
         return gray.point(lambda value: 255 * value)
     return gray
+
+
+def see_through(image: Image.Image) -> bool:
+    """Return whether parts of an open picture are transparent."""
+    return image.has_transparency_data and bool(np.asarray(opacity(image)).min() < 128)
+
+
+def _is_cut_out(image: Image.Image) -> bool:
+    """Return whether parts are transparent, and the others a photo or dark: no mask in black and white."""
+    shown = np.asarray(image.convert("L"))[np.asarray(opacity(image)) >= 128]
+    drawn = shown.size > 0 and (shown.max() < 128 or np.mean((shown > 16) & (shown < 239)) > 0.1)
+    return bool(drawn) and see_through(image)
 
 
 def eight_bits(image: Image.Image) -> Image.Image:

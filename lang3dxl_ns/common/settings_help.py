@@ -15,7 +15,7 @@ Class = TypeVar("Class", bound=type)
 
 def without(*names: str) -> Callable[[Class], Class]:
     """Return a dataclass decorator that takes inherited settings off the command line."""
-    return lambda kind: _marked(kind, tyro.conf.Fixed, names)
+    return lambda kind: _marked(_marked(kind, tyro.conf.Fixed, names), tyro.conf.Suppress, names)
 
 
 def showing(*names: str) -> Callable[[Class], Class]:

@@ -31,3 +31,11 @@ def stoppable(stop: Callable[[signal.Signals], None]) -> Iterator[None]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+def end_at_once() -> None:
+    """Let Ctrl-C and SIGTERM end the process without a word from now on, unless its caller ignores them. A
+    command's work is then done and told, and Python's exit handlers would print a traceback below it."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        if signal.getsignal(number) is not signal.SIG_IGN:
+            signal.signal(number, signal.SIG_DFL)

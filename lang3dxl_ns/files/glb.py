@@ -9,6 +9,7 @@ import json
 import re
 import struct
 from collections.abc import Iterator, Sequence
+from io import BytesIO
 from math import isqrt
 from pathlib import Path
 from typing import Any
@@ -20,13 +21,16 @@ from numpy import ndarray as Array
 from torch import Tensor
 
 from lang3dxl_ns.common.checks import expect
+from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.files.activations import ALL_BANDS, array_of, check_memory, tensor_of
+from lang3dxl_ns.files.spz import decode_spz
 from lang3dxl_ns.rendering import Splats
 from lang3dxl_ns.scene.georeference import Georeference
 from lang3dxl_ns.things.thing import Thing
 
 _SPLATS, _RECORD = "KHR_gaussian_splatting", "LANG3DXL_scene"
+_SPZ = "KHR_gaussian_splatting_compression_spz"  # _2 and what follows: drafts, so they are read alone
 _FEATURES, _METADATA = "EXT_mesh_features", "EXT_structural_metadata"
 _HEADER, _CHUNK = struct.Struct("<4sII"), struct.Struct("<I4s")
 _FLOAT, _POINTS, _ARRAY_BUFFER = 5126, 0, 34962
@@ -171,13 +175,14 @@ class _Glb:
         self.binary = chunks.get(b"BIN\0", memoryview(b""))
         self.about: dict[str, Any] = json.loads(bytes(chunks[b"JSON"]))
 
-    def view(self, number: int) -> memoryview:
-        """Return the bytes of a buffer view."""
+    def view(self, number: int, row: int | None = None) -> memoryview:
+        """Return the bytes of a buffer view, of which each `row` follows the one before."""
         view = self.about["bufferViews"][number]
         start, size = view.get("byteOffset", 0), view["byteLength"]
         inside = isinstance(start, int) and isinstance(size, int) and 0 <= start <= start + size
         expect(inside and start + size <= len(self.binary), "a part lies outside of it")
-        expect(view["buffer"] == 0 and "byteStride" not in view, "its parts are interleaved, or other files")
+        whole = view["buffer"] == 0 and view.get("byteStride", row) == row
+        expect(whole, "its parts are interleaved, or other files")
         return self.binary[start : start + size]
 
     def values(self, number: int, side: int) -> Float32[Array, "n side"]:
@@ -186,8 +191,8 @@ class _Glb:
         kind, count = _KINDS[accessor["componentType"]], accessor["count"]
         offset = accessor.get("byteOffset", 0)
         expect(_SIDES[accessor["type"]] == side and "sparse" not in accessor, "an attribute has another form")
-        content = self.view(accessor["bufferView"])
-        size = count * side * np.dtype(kind).itemsize
+        row = side * np.dtype(kind).itemsize
+        content, size = self.view(accessor["bufferView"], row), count * row
         expect(0 <= offset <= offset + size <= len(content), "an attribute is cut short")
         values: Shaped[Array, " m"] = np.frombuffer(content[offset : offset + size], kind)
         largest = np.iinfo(values.dtype).max if accessor.get("normalized") else 1
@@ -196,29 +201,33 @@ class _Glb:
 
 def read_glb(path: Path) -> Splats:
     """Read the first splats of a file, in the frame of their own node. Raises UserError if it has none, or
-    they are compressed, and one of `DAMAGE` for a damaged file."""
+    they are compressed otherwise than as SPZ, and one of `DAMAGE` for a damaged file."""
     file = _Glb(path)
     meshes = (primitive for mesh in file.about.get("meshes", []) for primitive in mesh["primitives"])
-    found = next((one for one in meshes if _SPLATS in one.get("extensions", {})), None)
-    if found is None:
+    splats = [one for one in meshes if _SPLATS in one.get("extensions", {})]
+    if not splats:
         raise UserError(f"it holds no splats ({_SPLATS}): export it as a splat")
-    named = found["attributes"]
-    if found["extensions"][_SPLATS].get("extensions"):
-        raise UserError("its splats are compressed by another extension: export them without compression")
+    if len(splats) > 1:
+        say(f"{path} holds {len(splats)} splats, of which the first is read: join them in a splat editor")
+    named = (found := splats[0])["attributes"]
+    for name, about in (found["extensions"][_SPLATS].get("extensions") or {}).items():
+        if not name.startswith(_SPZ):
+            raise UserError(f"its splats are compressed by {name}: export them without compression")
+        return decode_spz(BytesIO(file.view(about["bufferView"])))
+    if f"{_SPLATS}:SCALE" not in named or _harmonic(0) not in named:
+        raise UserError(f"its attributes are those of points, or of a draft of {_SPLATS}: export it anew")
     degree = max(d for d in range(_MOST_DEGREE + 1) if _harmonic(d**2) in named)
     check_memory(file.about["accessors"][named["POSITION"]]["count"], ALL_BANDS)
-    parts = [file.values(named[name], 3) for name in ("POSITION", f"{_SPLATS}:SCALE")]
+    means, scales = (tensor_of(file.values(named[name], 3)) for name in ("POSITION", f"{_SPLATS}:SCALE"))
     quats = np.roll(file.values(named[f"{_SPLATS}:ROTATION"], 4), 1, axis=1)
     opacities = file.values(named[f"{_SPLATS}:OPACITY"], 1)[:, 0]
     harmonics = np.stack(
         [file.values(named[_harmonic(band)], 3) for band in range((degree + 1) ** 2)], axis=1
     )
-    expect(
-        {len(part) for part in (*parts, quats, opacities)} == {len(harmonics)},
-        "its attributes differ in size",
-    )
+    sizes = {len(means), len(quats), len(scales), len(opacities), len(harmonics)}
+    expect(len(sizes) == 1, "its attributes differ in size")
     antialiased = bool((found.get("extras") or {}).get("antialiased", False))
-    means, scales = map(tensor_of, parts)
+    scales = scales.exp() if (scales < 0).any() else scales  # splat-transform wrote logarithms until 2026
     return Splats(means, tensor_of(quats), scales, tensor_of(opacities), tensor_of(harmonics), antialiased)
 
 

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from lang3dxl_ns.common.checks import expect
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.pictures import color_bytes
 from lang3dxl_ns.common.ply_tables import Table, read_header, read_vertices
 from lang3dxl_ns.files.activations import ALL_BANDS, activated, array_of, check_memory, log_scales, logits
 from lang3dxl_ns.rendering import Splats, harmonics_of
@@ -34,7 +35,7 @@ def read_ply(path: Path) -> Splats:
         if "chunk" in tables and "packed_position" in names:
             return _supersplat(path, tables)
         # CloudCompare names all columns but the coordinates so.
-        known = {name.removeprefix("scalar_"): name for name in names}
+        known = {name.lower().removeprefix("scalar_"): name for name in names}
         if missing := [name for name in _NEEDED if name not in known]:
             raise UserError(f"not a splat but a point cloud: its points have no {', '.join(missing[:3])}")
         check_memory(vertices.length, 1 + sum(name.startswith("f_rest_") for name in known) // 3)
@@ -53,8 +54,10 @@ def _splats_of(table: Any) -> Splats:
     if "f_dc_0" in table:
         first = columns("f_dc_0", "f_dc_1", "f_dc_2")[:, None]
     else:
-        colors = columns("red", "green", "blue")  # 0 to 255, or 0 to 1
-        first = harmonics_of(colors / (255 if (colors > 1).any() else 1))
+        plain = np.stack([table[name] for name in ("red", "green", "blue")], axis=1)
+        whole = plain.dtype.kind != "f"  # 0 to 255, or 0 to 1, where each may be dark
+        colors = torch.from_numpy((color_bytes(plain) if whole else plain).astype(np.float32))
+        first = harmonics_of(colors / (255 if whole or (colors > 1).any() else 1))
     if len(rest) not in (0, 9, 24, 45, 72):
         raise UserError(f"it has {len(rest)} columns f_rest, not 9, 24, 45 or 72: export it anew")
     # Coefficients are stored channel by channel.

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
+from datetime import datetime
 from pathlib import Path
 
+from lang3dxl_ns.common.console import say_once
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import expanded
 from lang3dxl_ns.scene.record import SCENE_FILE
@@ -17,8 +20,8 @@ _DEEPEST = 4
 
 def find_config(run: str | Path | None = None) -> Path:
     """Find the config.yml of a run: the file itself, or that in the run's folder, or in a folder above it,
-    whose newest run is taken; None: the newest run under outputs/. Runs of other methods, which lack a scene
-    description, are skipped. Raises UserError if there is no run."""
+    whose newest run is taken, which is said; None: the newest run under outputs/. Runs of other methods,
+    which lack a scene description, are skipped. Raises UserError if there is no run."""
     place = OUTPUTS if run is None else expanded(run)
     if place.is_dir():
         if place.joinpath("config.yml").is_file():
@@ -27,10 +30,20 @@ def find_config(run: str | Path | None = None) -> Path:
         configs = [path for path in found if path.is_file()]
         ours = [path for path in configs if path.with_name(SCENE_FILE).is_file()]
         if ours:
-            return max(ours, key=lambda path: path.stat().st_mtime)
+            newest = max(ours, key=_began)
+            if len(ours) > 1:
+                say_once(f"Opening {newest.parent}, the newest of {len(ours)} runs in {place}")
+            return newest
         others = f" of this method ({len(configs)} of others)" if configs else ""
         raise UserError(f"{place} holds no run{others}: {_REMEDY}")
     if not place.is_file():
         what = "there is no outputs/ here" if run is None else f"{place} is not a file or folder"
         raise UserError(f"{what}: {_REMEDY}")
     return place
+
+
+def _began(config: Path) -> float:
+    """Return when a run began: by its folder's name, or else by the file's time, which a copy changes."""
+    with suppress(ValueError):
+        return datetime.strptime(config.parent.name, "%Y-%m-%d_%H%M%S").timestamp()
+    return config.stat().st_mtime

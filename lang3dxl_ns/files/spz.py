@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from io import BufferedIOBase, BytesIO
 from math import floor, log2
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 import torch.nn.functional as F
@@ -36,12 +36,19 @@ _HIGHEST_DEGREE = 4
 
 
 def read_spz(path: Path) -> Splats:
-    """Read the Gaussians of a file of any version. No memory is allocated beyond what the header announces.
-    Raises UserError for an unknown version or degree, and one of `DAMAGE` for a damaged file."""
-    with _opened(path) as (stream, version, count, degree, bits, flags, streams):
+    """Read the Gaussians of a file of any version, as `decode_spz` does."""
+    with path.open("rb") as file:
+        return decode_spz(file)
+
+
+def decode_spz(file: BinaryIO) -> Splats:
+    """Decode the Gaussians of any version. No memory is allocated beyond what the header announces. Raises
+    UserError for an unknown version or degree, and one of `DAMAGE` for a damaged file."""
+    with _opened(file) as (stream, version, count, degree, bits, flags, streams):
         if degree > _HIGHEST_DEGREE:
             raise UserError(f"its harmonics have degree {degree}; 0 to 4 can be read: export it anew")
         expect(bits <= 24, f"its coordinates have {bits} fractional bits")
+        expect(count > 0, "it holds no Gaussian")
         check_memory(count, ALL_BANDS)
         sides = _sides(version, degree)
         if version < 4:
@@ -54,7 +61,7 @@ def read_spz(path: Path) -> Splats:
 
 def scene_record(path: Path) -> bytes | None:
     """Read the scene file in a file; None if there is none. Raises what `read_spz` does."""
-    with _opened(path) as (stream, version, count, degree, _, flags, _):
+    with path.open("rb") as file, _opened(file) as (stream, version, count, degree, _, flags, _):
         if version < 4:  # records end the stream; in version 4 they follow the header of 32 bytes
             stream.seek(_HEADER.size + count * sum(_sides(version, degree)))
         else:
@@ -71,19 +78,18 @@ def scene_record(path: Path) -> bytes | None:
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[tuple[Any, ...]]:
+def _opened(file: BinaryIO) -> Iterator[tuple[Any, ...]]:
     """Open a file of any version: its unpacked stream after the header, and the header's numbers."""
-    with path.open("rb") as file:
-        packed = file.read(2) == b"\x1f\x8b"
-        file.seek(0)
-        with gzip.open(file) if packed else file as stream:
-            head = stream.read(_HEADER.size)
-            expect(len(head) == _HEADER.size, "its header is cut short")
-            magic, version, *numbers = _HEADER.unpack(head)
-            expect(magic == _MAGIC, "it doesn't begin like an SPZ")
-            if version != 4 if not packed else not 1 <= version <= 3:
-                raise UserError(f"it is SPZ of version {version}; 1 to 4 can be read: save it as one of them")
-            yield stream, version, *numbers
+    packed = file.read(2) == b"\x1f\x8b"
+    file.seek(0)
+    with gzip.open(file) if packed else file as stream:
+        head = stream.read(_HEADER.size)
+        expect(len(head) == _HEADER.size, "its header is cut short")
+        magic, version, *numbers = _HEADER.unpack(head)
+        expect(magic == _MAGIC, "it doesn't begin like an SPZ")
+        if not 1 <= version <= 4:
+            raise UserError(f"it is SPZ of version {version}; 1 to 4 can be read: save it as one of them")
+        yield stream, version, *numbers
 
 
 _MORE = "it unpacks to more than its header announces"

@@ -77,7 +77,7 @@ class Lang3DXLDataManagerConfig(PreparationConfig, FullImageDatamanagerConfig):
 
 
 _BOUNDS = {"camera_res_scale_factor": (0.001, 8), "cache_gb": (0, 1e6), "read_ahead": (0, 1000)}
-_OF_PARSER = {"scale_factor": (1e-9, 1e9), "scene_scale": (1e-9, 1e9), "train_split_fraction": (0, 1)}
+_OF_PARSER = {"scale_factor": (1e-9, 1e9), "scene_scale": (1e-9, 1e9)}
 
 
 class Lang3DXLDataManager(FullImageDatamanager):

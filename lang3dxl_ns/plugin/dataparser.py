@@ -6,6 +6,7 @@ import json
 from dataclasses import dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
@@ -23,7 +24,7 @@ from lang3dxl_ns.common.settings_help import without
 from lang3dxl_ns.plugin.cameras import to_nerfstudio
 from lang3dxl_ns.plugin.inert_settings import OF_COLMAP
 from lang3dxl_ns.scene.capture import Capture, CaptureSettings, find_source, open_capture, say_left_out
-from lang3dxl_ns.scene.frame import Frame
+from lang3dxl_ns.scene.frame import Center, Frame, Orientation
 from lang3dxl_ns.scene.photo import Photo
 from lang3dxl_ns.scene.record import SCENE_FILE, SceneRecord
 from lang3dxl_ns.scene.transforms import TRANSFORMS
@@ -47,6 +48,9 @@ class PhotoCollectionDataParserConfig(ColmapDataParserConfig):
     place of every eighth photo. `lang3dxl evaluate split` makes one from ground truth."""
     follow_links: bool = False
     """Whether photos and masks may be symbolic links that leave their folder."""
+    eval_mode: Literal["interval", "all"] = "interval"
+    orientation_method: Orientation = "up"
+    center_method: Center = "poses"
     downscale_factor: int | None = 1
     """Always 1, since photos are resized on reading (--pipeline.datamanager.camera-res-scale-factor)."""
 

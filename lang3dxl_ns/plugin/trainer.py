@@ -51,7 +51,7 @@ _BEFORE_TRAINING = ("config.yml", SCENE_FILE, f"{NEEDS_FILE}.*", "dataparser_tra
 
 
 class _Stopped(BaseException):
-    """Raised when a signal arrives while words are learned."""
+    """Raised when a signal arrives while words are learned, or a finished run is shown."""
 
 
 @contextmanager
@@ -115,6 +115,7 @@ class Lang3DXLTrainer(Trainer):
     words_are_learned = False
     """Whether the final words of the run are learned. Words that a viewer learns during a run don't count."""
     _is_learning_words = False
+    _is_shown = False  # finished and saved, with its viewer open
     _last_iteration = -1
     _is_ending = False
     _run_state: dict[str, Any] | None = None
@@ -325,9 +326,10 @@ class Lang3DXLTrainer(Trainer):
 
     def _stop(self, number: signal.Signals) -> None:
         """End training after the current iteration, with a checkpoint. Learning words, which a checkpoint
-        precedes, ends at once."""
-        self.interrupted, self.stop_training = number, True
-        if self._is_learning_words:
+        precedes, ends at once, and so does the viewer of a finished run."""
+        if not self._is_shown:
+            self.interrupted, self.stop_training = number, True
+        if self._is_learning_words or self._is_shown:
             raise _Stopped
 
     def _stop_early(self) -> str:
@@ -370,8 +372,10 @@ class Lang3DXLTrainer(Trainer):
         self.save_checkpoint(self.step)
         for callback in self.callbacks:
             callback.run_callback_at_location(self.step, TrainingCallbackLocation.AFTER_TRAIN)
-        if not self.config.viewer.quit_on_train_completion:
-            self._train_complete_viewer()
+        if not (self.config.viewer.quit_on_train_completion or self.interrupted):
+            with suppress(_Stopped):
+                self._is_shown = True
+                self._train_complete_viewer()
 
     def write_scene(self) -> None:
         """Write the trained scene as one file into the run's folder, for queries and sharing. It keeps the
@@ -433,5 +437,5 @@ class Lang3DXLTrainer(Trainer):
         done = step + 1 >= self.config.pipeline.model.total_steps and (
             self.words_are_learned or not self.pipeline.model.run.learns_words_at_the_end
         )
-        if self._is_ending and not self.interrupted and done:
+        if self._is_ending and done:
             self.write_scene()

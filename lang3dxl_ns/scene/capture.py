@@ -5,12 +5,11 @@ A capture comes from a COLMAP model, a transforms.json, a folder of photos alone
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
-from pathlib import Path, PurePosixPath
+from functools import cached_property, partial
+from pathlib import Path
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -19,11 +18,11 @@ from jaxtyping import Float32, Float64, UInt8
 from numpy import ndarray as Array
 
 from lang3dxl_ns.common.console import say, some
-from lang3dxl_ns.common.errors import UserError, printable
+from lang3dxl_ns.common.errors import UserError, printable, readable
 from lang3dxl_ns.common.files import expanded, read_names
 from lang3dxl_ns.scene.camera import camera_to_world
 from lang3dxl_ns.scene.colmap import Reconstruction, TrackedPhoto, photos_in_model, read_reconstruction
-from lang3dxl_ns.scene.companions import inside
+from lang3dxl_ns.scene.companions import inside, is_inside
 from lang3dxl_ns.scene.frame import COLMAP_UP, Center, Frame, Orientation, find_frame, lost_cameras
 from lang3dxl_ns.scene.layout import (
     MODEL_FOLDERS,
@@ -34,7 +33,7 @@ from lang3dxl_ns.scene.layout import (
     whole_scene,
 )
 from lang3dxl_ns.scene.masks import mask_folder
-from lang3dxl_ns.scene.names import resolve
+from lang3dxl_ns.scene.names import listed, resolve
 from lang3dxl_ns.scene.photo import Photo, upright_in_model
 from lang3dxl_ns.scene.photo_folder import extract_frames, find_photos, frames_folder, is_video, photos_below
 from lang3dxl_ns.scene.reconstruct import reconstruct_scene, shows_these
@@ -67,13 +66,9 @@ class CaptureSettings:
     """Text file with names of the photos to hold out, in place of a rule."""
     follow_links: bool = False
     """Whether photos and masks may be symbolic links that leave their folder."""
-    eval_mode: Literal["fraction", "filename", "interval", "all"] = "interval"
-    """Rule for the held-out photos: a share of them, those with "eval" in their names, every
-    `eval_interval`-th one, or none."""
-    train_split_fraction: float = 0.9
-    """Share of the photos to train on, for the rule "fraction"."""
+    eval_mode: Literal["interval", "all"] = "interval"
+    """Rule for the held-out photos: every `eval_interval`-th one in the order of names, or none."""
     eval_interval: int = 8
-    """Distance of held-out photos in the order of names, for the rule "interval"."""
     orientation_method: Orientation = "up"
     """Direction that becomes z in training: see `find_frame`."""
     center_method: Center = "poses"
@@ -137,14 +132,10 @@ class Capture:
         lists = [self.folder / name for name in _SPLIT_LISTS if (self.folder / name).is_file()]
         if not lists:
             return None
-        parts = {path: self._named(path) for path in lists}
-        train, held_out = (
-            frozenset[str]().union(
-                *(names for path, names in parts.items() if path.name.startswith("train") is kind)
-            )
-            for kind in (True, False)
+        parts = (
+            [self._named(f) for f in lists if f.name.startswith("train") is kind] for kind in (True, False)
         )
-        return self._of_lists(train or None, held_out or None)
+        return self._of_lists(*(frozenset[str]().union(*part) or None for part in parts))
 
     def _of_lists(self, train: frozenset[str] | None, held_out: frozenset[str] | None) -> Split:
         """Split by two lists. One that is missing holds all other photos."""
@@ -153,33 +144,15 @@ class Capture:
         return Split(tuple(chosen), tuple(others))
 
     def _named(self, path: Path) -> frozenset[str]:
-        """Read a list of photos, which may lack folders or endings. Raises UserError for an unknown one."""
-        paths = {name: PurePosixPath(name) for name in (*self.names, *self.left_out)}
-        forms = {n: {n, str(path.with_suffix("")), path.name, path.stem} for n, path in paths.items()}
-        found = set()
-        for name in read_names(path):
-            fitting = [name] if name in forms else [known for known in forms if name in forms[known]]
-            if len(fitting) != 1:
-                fits = f"which fits {len(fitting)} photos of the scene: correct the list"
-                raise UserError(f"{path} names {name}, {fits}")
-            found.add(fitting[0])
-        return frozenset(found)
+        """Read a list of photos. Raises UserError for an unknown one."""
+        with readable(f"{path} can't be used", "correct the list"):
+            return listed(read_names(path), {*self.names, *self.left_out}, "it")
 
     def _split_by_rule(self) -> Split:
-        names, settings = self.names, self.settings
-        if settings.eval_mode == "all":
-            return Split(tuple(names), tuple(names))
-        if settings.eval_mode == "fraction":
-            count = math.ceil(len(names) * settings.train_split_fraction)
-            chosen = {names[i] for i in np.linspace(0, len(names) - 1, count, dtype=int)} if names else set()
-        elif settings.eval_mode == "filename":
-            chosen = {name for name in names if "train" in PurePosixPath(name).name}
-            unknown = [n for n in names if n not in chosen and "eval" not in PurePosixPath(n).name]
-            if unknown:
-                raise UserError(f"--eval-mode filename: {unknown[0]} has neither train nor eval in its name")
-        else:
-            chosen = {name for i, name in enumerate(names) if i % settings.eval_interval}
-        return Split(tuple(n for n in names if n in chosen), tuple(n for n in names if n not in chosen))
+        if self.settings.eval_mode == "all":
+            return Split(tuple(self.names), tuple(self.names))
+        every = self.settings.eval_interval
+        return Split(tuple(n for i, n in enumerate(self.names) if i % every), tuple(self.names[::every]))
 
     @cached_property
     def frame(self) -> Frame:
@@ -295,22 +268,12 @@ def find_source(
 
 def _of_model(folder: Path, model: Path, settings: CaptureSettings) -> Capture:
     found, images = read_reconstruction(model), images_folder(folder, model, settings.images_path)
-    links = settings.follow_links
-    exists = lambda name: _exists(images, name)  # noqa: E731
+    exists = partial(is_inside, images)
     files, doubts = resolve(list(found.photos), exists, lambda: photos_below(images), "photos")
     places = {name: files.get(name, name) for name in found.photos}
-    capture = _usable(folder, images, found, places, doubts, settings, links)
+    capture = _usable(folder, images, found, places, doubts, settings, settings.follow_links)
     _mention_what_is_not_used(capture, model, set(places.values()))
     return replace(capture, source=model)
-
-
-def _exists(folder: Path, name: str) -> bool:
-    """Return whether a name is that of a file, a link or something else in the folder."""
-    try:
-        path = inside(folder, name, follow_links=True)
-    except UserError:
-        return False
-    return path.is_symlink() or path.exists()
 
 
 def _usable(
@@ -342,10 +305,13 @@ def _usable(
             kept[file] = turned
         except UserError as reason:
             left_out[name] = str(reason)
-    if masks is not None and masks.count and photos and all(photo.mask_path is None for photo in photos):
+    if cut_out := [photo.name for photo in photos if photo.mask_path == photo.path]:
+        say(f"{len(cut_out)} photos have transparent parts, which do not count: {some(cut_out, 3)}")
+    unmasked = photos and all(photo.mask_path in (None, photo.path) for photo in photos)
+    if masks is not None and unmasked and any(masks.folder.iterdir()):
         say(
-            f"{masks.folder} has {masks.count} pictures, and none is named like a photo (such as "
-            f"{photos[0].name}): no mask is used. Name masks like the photos, with .png or .jpg"
+            f"{masks.folder} has no picture that is named like a photo (as {photos[0].name}): no mask is "
+            "used. Name masks like the photos, with .png or .jpg"
         )
     photos.sort(key=lambda photo: photo.name)
     kept = dict(sorted(kept.items()))
@@ -358,14 +324,13 @@ def _mention_what_is_not_used(capture: Capture, model: Path, listed: set[str]) -
     beside = sorted(model.parent.glob("[0-9]*")) if model.name.isdigit() else []
     others = [f for f in beside if f != model and f.name.isdigit() and any(f.glob("images.*"))]
     if others:
-
-        def counted(found: Path) -> str:
-            return f"{os.path.relpath(found, capture.folder)} with {photos_in_model(found)}"
-
+        counted = [
+            f"{os.path.relpath(f, capture.folder)} with {photos_in_model(f)}" for f in (model, *others)
+        ]
         say(
-            f"{capture.folder} has {len(others) + 1} models; used is {counted(model)} photos. There are also "
-            f"{', '.join(map(counted, others))}: choose with `lang3dxl-colmap --colmap-path FOLDER` after "
-            "all other options"
+            f"{capture.folder} has {len(counted)} models; used is {counted[0]} photos. There are also "
+            f"{', '.join(counted[1:])}: choose with `lang3dxl-colmap --colmap-path FOLDER` after all other "
+            "options"
         )
     unknown = [name for name in photos_below(capture.images) if name not in listed]
     if unknown:

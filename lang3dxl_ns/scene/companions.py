@@ -33,6 +33,14 @@ def inside(folder: Path, name: str, follow_links: bool = False) -> Path:
     return path
 
 
+def is_inside(folder: Path, name: str) -> bool:
+    """Return whether a name is that of a file, a link or something else in the folder."""
+    try:
+        return os.path.lexists(inside(folder, name, follow_links=True))
+    except UserError:
+        return False
+
+
 def is_name(name: object) -> bool:
     """Return whether this can name a photo in a folder: relative, without .. and control characters."""
     if not isinstance(name, str) or not is_plain(name):

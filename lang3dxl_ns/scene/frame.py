@@ -10,8 +10,8 @@ from jaxtyping import Bool, Float, Float64
 from numpy import ndarray as Array
 from scipy.spatial.transform import Rotation
 
-Orientation = Literal["pca", "up", "vertical", "none"]
-Center = Literal["poses", "focus", "none"]
+Orientation = Literal["up", "vertical", "none"]
+Center = Literal["poses", "none"]
 
 COLMAP_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 """Rotation from COLMAP's usual y down to z up."""
@@ -63,22 +63,17 @@ def find_frame(
         points: the capture's points, which tell whether the cameras stand apart.
         axes: rotation of the world to z up that is applied first.
         orientation: "up" turns the cameras' mean up axis to z; "vertical" turns the direction to z that is
-            orthogonal to their right axes; "pca" turns the principal axes of their positions to x, y, z.
-        center: the origin is the cameras' mean ("poses"), the point nearest to their optical axes ("focus"),
-            or the world's.
+            orthogonal to their right axes.
+        center: the origin is the cameras' mean ("poses"), or the world's.
         auto_scale: whether the farthest coordinate of a camera becomes 1.
         factor: scale in addition.
     """
     origin = poses[:, :, 3].mean(axis=0)  # subtracted first, as the differences are small
     turned = axes @ np.concatenate([poses[:, :, :3], (poses[:, :, 3] - origin)[..., None]], axis=2)
     turn = _turn(turned, orientation)
-    middle = _focus(turned) if center == "focus" else np.zeros(3)
-    offsets = (turned[:, :, 3] - middle) @ turn.T
+    offsets, shift = turned[:, :, 3] @ turn.T, -turn @ axes @ origin
     if center == "none":
-        offsets = poses[:, :, 3] @ (turn @ axes).T
-        shift = np.zeros(3)
-    else:
-        shift = -turn @ (axes @ origin + middle)
+        offsets, shift = poses[:, :, 3] @ (turn @ axes).T, np.zeros(3)
     far = float(np.abs(offsets).max())
     scale = factor / far if auto_scale and far > 0 and _apart(poses[:, :, 3], points) else factor
     return Frame(np.column_stack([turn @ axes, shift]), scale)
@@ -120,18 +115,4 @@ def _turn(poses: Float[Array, "n 3 4"], orientation: Orientation) -> Float64[Arr
         if len(poses) > 1 and sizes[1] > _PARALLEL * np.sqrt(len(poses)):
             return turned_to(axes[2] * np.copysign(1.0, axes[2] @ up), up_axis)
         return turned_to(up - axes[0] * (axes[0] @ up), up_axis)
-    if orientation == "pca":
-        axes = np.linalg.eigh(np.cov(poses[:, :, 3], rowvar=False, bias=True))[1].T[::-1].copy()
-        axes[2] *= np.sign(np.linalg.det(axes))
-        axes[1:] *= np.copysign(1.0, axes[2] @ up)
-        return axes
     return np.eye(3)
-
-
-def _focus(poses: Float[Array, "n 3 4"]) -> Float64[Array, "3"]:
-    """Compute the point nearest to the optical axes; the cameras' mean if these are parallel."""
-    across = np.eye(3) - poses[:, :, 2, None] * poses[:, None, :, 2]
-    total = across.sum(axis=0)
-    if np.linalg.cond(total) > 1e8:
-        return poses[:, :, 3].mean(axis=0)
-    return np.linalg.solve(total, (across @ poses[:, :, 3, None]).sum(axis=0)[:, 0])

@@ -9,12 +9,11 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from itertools import combinations
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float64
+from jaxtyping import Float64
 from numpy import ndarray as Array
 from PIL import ExifTags
 
@@ -29,7 +28,6 @@ GPS_ERROR = 5.0
 """Usual horizontal error of a phone's GPS in meters."""
 LARGEST_UNCERTAINTY = 0.25
 """Relative uncertainty of the scale above which GPS tells nothing."""
-_PAIRS = 2_000
 _TAGS = ExifTags.GPS
 
 
@@ -91,7 +89,7 @@ def georeference(
     """Find meters and north of a frame by a robust fit of its cameras to their GPS positions.
 
     The fit is the similarity of the plane (scale, heading, shift) on which most cameras are within 2.5 usual
-    errors of GPS of their positions. It is found from pairs of photos, and refined by least squares.
+    errors of GPS of their positions.
 
     Args:
         centers: camera centers in the scene's frame.
@@ -102,26 +100,24 @@ def georeference(
         The georeference; None if under three photos agree, or if they are so close together that the error of
         GPS leaves the scale uncertain by more than a quarter.
     """
+    import cv2
+
     known = [i for i, position in enumerate(positions) if position is not None]
     if len(known) < LEAST_PHOTOS:
         return None
     east, north, unit_up = turned_to(up, (0, 0, 1))
-    ground = centers[known] @ np.stack([east, north], axis=1)
-    plan = ground[:, 0] + 1j * ground[:, 1]
-    places = local_meters([p for p in positions if p is not None])
-    target = places[:, 0] + 1j * places[:, 1]
-    agree = _largest_agreement(plan, target)
-    if agree.sum() < LEAST_PHOTOS:
+    plan = (centers[known] - centers[known].mean(axis=0)) @ np.stack([east, north], axis=1)
+    places = local_meters([p for p in positions if p is not None])[:, :2].copy()
+    fit, chosen = cv2.estimateAffinePartial2D(plan, places, ransacReprojThreshold=2.5 * GPS_ERROR)
+    if fit is None or np.count_nonzero(chosen) < LEAST_PHOTOS:
         return None
-    factor, shift = _fitted(plan[agree], target[agree])
-    if factor == 0:
-        return None
-    rest = np.abs(target[agree] - factor * plan[agree] - shift)
+    agree, factor = chosen[:, 0] > 0, complex(fit[0, 0], fit[1, 0])
+    rest = np.linalg.norm(places - plan @ fit[:, :2].T - fit[:, 2], axis=1)[agree]
     # Positions of a walk share some of their error, so a small residual doesn't make GPS exact.
     error = max(float(np.sqrt((rest**2).mean())), GPS_ERROR / 2)
-    spread = np.abs(target[agree] - target[agree].mean())
+    spread = places[agree] - places[agree].mean(axis=0)
     uncertainty = error / max(float(np.sqrt((spread**2).sum())), 1e-9)
-    if uncertainty > LARGEST_UNCERTAINTY:
+    if uncertainty > LARGEST_UNCERTAINTY or factor == 0:
         return None
     heading = 1j / (factor / abs(factor))  # the plan's direction that points north
     axis = heading.real * east + heading.imag * north
@@ -142,28 +138,6 @@ def local_meters(positions: Iterable[tuple[float, float, float]]) -> Float64[Arr
     earth = pycolmap.GPSTransform(pycolmap.GPSTransformEllipsoid.WGS84)
     meters: Float64[Array, "n 3"] = earth.ellipsoid_to_enu(degrees, *middle)
     return meters
-
-
-def _largest_agreement(plan: Array, target: Array) -> Bool[Array, " n"]:
-    """Find the largest set of photos that one similarity of the plane moves to their positions."""
-    pairs = np.random.default_rng(0).permutation(list(combinations(range(len(plan)), 2)))[:_PAIRS]
-    best = np.zeros(len(plan), dtype=bool)
-    for a, b in pairs:
-        if (length := plan[b] - plan[a]) != 0:
-            factor = (target[b] - target[a]) / length
-            rest = np.abs(target - target[a] - factor * (plan - plan[a]))
-            agree = rest <= 2.5 * GPS_ERROR
-            if factor != 0 and agree.sum() > best.sum():
-                best = agree
-    return best
-
-
-def _fitted(plan: Array, target: Array) -> tuple[complex, complex]:
-    """Fit target = factor · plan + shift by least squares; the factor's length is the scale."""
-    a, b = plan - plan.mean(), target - target.mean()
-    power = float((np.abs(a) ** 2).sum())
-    factor = complex((a.conj() * b).sum() / power) if power > 0 else 0j
-    return factor, complex(target.mean() - factor * plan.mean())
 
 
 def _degrees(parts: Sequence[float], side: str, negative: str) -> float:

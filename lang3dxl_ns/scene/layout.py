@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import os
+import shlex
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 from lang3dxl_ns.common.console import say
+from lang3dxl_ns.common.errors import DAMAGE
+from lang3dxl_ns.common.files import read_text
 from lang3dxl_ns.scene.colmap import photos_in_model
 from lang3dxl_ns.scene.photo_folder import find_photos, photos_below
 
@@ -90,3 +94,7 @@ def mention_other_cameras(folder: Path) -> None:
                 f"{found} holds cameras of {program}, which can't be read here: the photos are reconstructed "
                 "anew. To use them, export a COLMAP model or a transforms.json (ns-process-data) beside it"
             )
+    for path in folder.glob("*.json"):
+        with suppress(*DAMAGE):
+            if '"transform_matrix"' in read_text(path):
+                say(f"{path} holds cameras, too: to use them, give --data {shlex.quote(str(path))}")

@@ -47,10 +47,9 @@ class MaskFolder:
             raise UserError(f"{path} is not a regular file: replace or remove it")
         return inside(self.folder, file, self._follow_links)
 
-    @property
-    def count(self) -> int:
-        """Number of pictures in the folder."""
-        return len({file for files in self._files.values() for file in files})
+    def __bool__(self) -> bool:
+        """Whether it has a picture."""
+        return bool(self._files)
 
     @cached_property
     def _files(self) -> dict[_Key, list[str]]:
@@ -103,4 +102,4 @@ def mask_folder(
             if Path(path.name.casefold().lstrip("._")) in FOLDERS and path.is_dir():
                 return MaskFolder(path, follow_links)
     beside = MaskFolder(images, follow_links, beside=True)
-    return beside if beside.count else None
+    return beside or None

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import unicodedata
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from pathlib import PurePosixPath
 
+from lang3dxl_ns.common.checks import expect
 from lang3dxl_ns.common.console import say, some
 from lang3dxl_ns.common.errors import UserError
 
@@ -15,10 +16,10 @@ _Parts = tuple[str, ...]
 
 def normal_parts(name: str) -> _Parts:
     """Split a name into folders and file name, in one form: slashes of Windows, drives, `.` and leading `..`
-    are removed, capitals are small, and letters with accents are one character."""
+    and spaces at the ends are removed, capitals are small, and letters with accents are one character."""
     name = unicodedata.normalize("NFC", name.replace("\\", "/")).casefold()
     parts: list[str] = []
-    for part in name.split("/"):
+    for part in map(str.strip, name.split("/")):
         if part == ".." and parts:
             parts.pop()
         elif part not in ("", ".", "..") and not part.endswith(":"):
@@ -26,29 +27,25 @@ def normal_parts(name: str) -> _Parts:
     return tuple(parts)
 
 
-class NameFinder:
-    """Index of files, in which names of other programs are looked up.
+def name_finder(files: Iterable[str]) -> Callable[[str], list[str]]:
+    """Index files for names of other programs: return a function that finds those that fit a name best, one
+    if it is found, several if it is ambiguous. They have the same name, or else the same without its ending;
+    among several, the folders agree with the name's the farthest up."""
+    by_name, by_stem = defaultdict[str, list[str]](list), defaultdict[str, list[str]](list)
+    for file in files:
+        last = normal_parts(file)[-1]
+        by_name[last].append(file)
+        by_stem[_stem(last)].append(file)
 
-    A name finds the file of the same name, or else of the same name without its ending; among several, the
-    one whose folders agree with the name's the farthest up.
-    """
-
-    def __init__(self, files: Iterable[str]) -> None:
-        self._files = defaultdict[str, list[str]](list)
-        self._stems = defaultdict[str, list[str]](list)
-        for file in files:
-            last = normal_parts(file)[-1]
-            self._files[last].append(file)
-            self._stems[_stem(last)].append(file)
-
-    def find(self, name: str) -> list[str]:
-        """Return the files that fit a name best: one if it is found, several if it is ambiguous."""
-        parts = normal_parts(name)
-        if not parts:
+    def find(name: str) -> list[str]:
+        if not (parts := normal_parts(name)):
             return []
         *folders, last = parts
-        fitting = self._files.get(last) or self._stems.get(last) or self._stems.get(_stem(last), [])
-        return _deepest(tuple(folders), fitting)
+        return _deepest(
+            tuple(folders), by_name.get(last) or by_stem.get(last) or by_stem.get(_stem(last), [])
+        )
+
+    return find
 
 
 def _stem(name: str) -> str:
@@ -88,10 +85,10 @@ def resolve(
     if not others:
         return found, {}
     taken = set(found.values())
-    finder, refused = NameFinder(file for file in list_files() if file not in taken), dict[str, UserError]()
+    find, refused = name_finder(file for file in list_files() if file not in taken), dict[str, UserError]()
     guessed = dict[str, str]()
     for name in others:
-        fitting = finder.find(name)
+        fitting = find(name)
         if fitting == [name]:
             continue  # it is something else than a file
         if len(fitting) == 1:
@@ -106,3 +103,12 @@ def resolve(
         name, file = next(iter(guessed.items()))
         say(f"{len(guessed)} of {len(names)} {what} have other names than listed: {some([name])} is {file}")
     return found | guessed, refused
+
+
+def listed(names: Sequence[str], known: Collection[str], what: str) -> frozenset[str]:
+    """Find the photos that a list (`what`, in messages) names among the `known` ones, as `resolve` does.
+    Raises ValueError for a name that fits none or several."""
+    found, _ = resolve(list(dict.fromkeys(names)), known.__contains__, lambda: known, what)
+    missing = [name for name in names if name not in found]
+    expect(not missing, f"{what} names {missing[:1]}, which fits no photo, or several")
+    return frozenset(found.values())

@@ -23,7 +23,7 @@ from PIL import ExifTags, Image
 from torch import Tensor
 
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.common.pictures import NoPictureError, eight_bits, mask_values, open_picture
+from lang3dxl_ns.common.pictures import NoPictureError, eight_bits, mask_values, open_picture, see_through
 from lang3dxl_ns.scene.camera import HasLens, Lens, scaled_size
 
 if TYPE_CHECKING:
@@ -51,9 +51,11 @@ class Photo(HasLens):
     @classmethod
     def from_model(cls, tracked: TrackedPhoto, path: Path, mask_path: Path | None = None) -> Photo:
         """Create a photo from the model (after `upright_in_model`), with its lens at the size of the file on
-        disk, so that resized photos work. Raises UserError for an unreadable file and for another aspect
-        ratio."""
-        size = _turned_size(stored_size(path, tracked.name)[0], tracked.quarter_turns)
+        disk, so that resized photos work. Without a mask, a photo with transparent parts is its own. Raises
+        UserError for an unreadable file and for another aspect ratio."""
+        with _readable(path, tracked.name), open_picture(path) as image:
+            size = _turned_size(image.size, tracked.quarter_turns)
+            mask_path = mask_path or (path if see_through(image) else None)
         _check_shape(tracked.name, path, size, (tracked.width, tracked.height))
         return cls(tracked.name, path, mask_path, tracked.lens.resized(*size), tracked.quarter_turns)
 

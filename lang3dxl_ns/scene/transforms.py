@@ -21,7 +21,7 @@ from lang3dxl_ns.common.files import read_json
 from lang3dxl_ns.scene.camera import Lens, check_pose, rigid, view_matrix
 from lang3dxl_ns.scene.colmap import FISHEYE_MODELS, PERSPECTIVE_MODELS, TrackedPhoto
 from lang3dxl_ns.scene.companions import inside
-from lang3dxl_ns.scene.names import resolve
+from lang3dxl_ns.scene.names import listed, resolve
 from lang3dxl_ns.scene.photo import stored_size
 from lang3dxl_ns.scene.photo_folder import files_below, photos_below
 from lang3dxl_ns.scene.ply_points import read_ply_points
@@ -35,6 +35,7 @@ _PERSPECTIVE = {
     "FULL_OPENCV": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
 }
 """Coefficients of the camera models, in OpenCV's order. Programs write those of another model, too."""
+_FISHEYE = ("k1", "k2", "k3", "k4")
 _LISTS = ("train_filenames", "val_filenames", "test_filenames")
 _NOTHING = np.zeros((0, 3))
 
@@ -193,13 +194,9 @@ def _listed(names: Any, found: _Found, key: str) -> frozenset[str] | None:
     if names is None:
         return None
     photos, _, left_out = found
-    expect(
-        isinstance(names, list) and all(isinstance(n, str) for n in names), f"{key} is not a list of names"
-    )
-    files, _ = resolve(names, lambda name: name in photos or name in left_out, lambda: photos, key)
-    missing = [name for name in names if name not in files]
-    expect(not missing, f"{key} names {missing[:1]}, which fits no photo, or several")
-    return frozenset(files.values())
+    texts = isinstance(names, list) and all(isinstance(name, str) for name in names)
+    expect(texts, f"{key} is not a list of names")
+    return listed(names, {*photos, *left_out}, key)
 
 
 def _points(name: Any, path: Path) -> tuple[Float64[Array, "m 3"], UInt8[Array, "m 3"]]:
@@ -292,9 +289,7 @@ def _distortion(frame: Mapping[str, Any], model: str, fisheye: bool, name: str) 
         )
         expect(all(map(is_coordinate, listed)), "distortion_params has a value that is not a number")
         known = dict(zip(("k1", "k2", "k3", "k4", "p1", "p2"), map(float, listed), strict=False)) | known
-    if fisheye:
-        return tuple(known.get(key, 0.0) for key in ("k1", "k2", "k3", "k4"))
-    keys = _PERSPECTIVE[model if model in _PERSPECTIVE else "OPENCV"]
+    keys = _FISHEYE if fisheye else _PERSPECTIVE[model if model in _PERSPECTIVE else "OPENCV"]
     further = [key for key in known if known[key] and key not in keys]
     if further:
         raise UserError(
@@ -303,7 +298,7 @@ def _distortion(frame: Mapping[str, Any], model: str, fisheye: bool, name: str) 
         )
     found = tuple(known.get(key, 0.0) for key in keys)
     found = found[:4] if len(found) == 5 and not found[4] else found
-    return found if any(found) else ()
+    return found if fisheye or any(found) else ()
 
 
 def _number(frame: Mapping[str, Any], key: str) -> float:

@@ -156,9 +156,7 @@ def test_what_makes_sense_passes():
     QueryConfig(threshold=1.0)
 
 
-@pytest.mark.parametrize(
-    ("name", "value"), [("train_split_fraction", math.nan), ("scale_factor", 0.0), ("scene_scale", math.nan)]
-)
+@pytest.mark.parametrize(("name", "value"), [("scale_factor", 0.0), ("scene_scale", math.nan)])
 def test_settings_of_the_parser(name, value):
     config = deepcopy(lang3dxl.config)
     setattr(config.pipeline.datamanager.dataparser, name, value)

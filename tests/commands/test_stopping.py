@@ -1,8 +1,11 @@
 """Ctrl-C and SIGTERM in a command: no partial files, and the command can be repeated."""
 
+import atexit
 import importlib
 import os
 import signal
+import subprocess
+import sys
 import time
 from typing import Any
 
@@ -110,3 +113,46 @@ def test_a_stopped_evaluation_leaves_the_report_that_was_there(tmp_path):
     place = ("lang3dxl_ns.evaluation.predictions", "_read_array")
     stop(*place, signal.SIGTERM, [*arguments, str(tmp_path / "out")], stopped_in_a_finalizer)
     assert (tmp_path / "out" / "scores.json").read_bytes() == before
+
+
+SIGNALED = """
+import atexit, os, signal, sys
+signal.signal(signal.SIGINT, getattr(signal, sys.argv.pop(1)))  # shells start background jobs without it
+number = int(sys.argv.pop(1))
+atexit.register(lambda: (os.kill(os.getpid(), number), print("went on")))
+from lang3dxl_ns.cli import main
+sys.exit(main())
+"""
+
+
+def signaled(number: signal.Signals, handler: str, word: str) -> Any:
+    """A command that receives a signal while Python runs the exit handlers."""
+    script = [sys.executable, "-c", SIGNALED, handler, str(int(number)), word]
+    return subprocess.run(script, capture_output=True, text=True)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("word", ["--help", "unknown"])
+def test_a_signal_after_a_command_has_told_its_end_ends_it_without_a_word(number, word):
+    ended = signaled(number, "default_int_handler", word)
+    assert ended.returncode == -number  # shells tell 130, or 143
+    assert ended.stdout.startswith("usage" if word == "--help" else "")
+    assert ended.stderr.count("\n") == (word == "unknown") and "went on" not in ended.stdout
+
+
+def test_a_signal_that_the_caller_ignores_stays_ignored_at_a_commands_end():
+    ended = signaled(signal.SIGINT, "SIG_IGN", "--help")
+    assert ended.returncode == 0 and "went on" in ended.stdout
+
+
+def end_of_nerfstudio() -> None:
+    """What nerfstudio's commands do: import torch and what else has exit handlers, and then our methods."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    atexit.register(lambda: (os.kill(os.getpid(), signal.SIGINT), print("went on")))
+    importlib.reload(importlib.import_module("lang3dxl_ns.methods"))
+
+
+@pytest.mark.nerfstudio
+def test_nerfstudios_commands_end_without_a_word_too():
+    ended = Process(end_of_nerfstudio).wait()
+    assert ended.returncode == -signal.SIGINT and not ended.stderr and "went on" not in ended.stdout

@@ -74,6 +74,42 @@ def test_a_glb_has_the_attributes_of_the_extension(tmp_path):
         np.testing.assert_allclose(values, wanted.flatten(), atol=1e-6)
 
 
+def glb_of(path, extension: dict, attributes: dict | None = None, content: bytes = b"") -> None:
+    """Write a GLB with one primitive, whose binary part is one view."""
+    primitive = {"attributes": attributes or {}, "extensions": {"KHR_gaussian_splatting": extension}}
+    view = {"buffer": 0, "byteLength": len(content)}
+    about = {"meshes": [{"primitives": [primitive]}], "bufferViews": [view]}
+    text = json.dumps(about).encode()
+    parts = (
+        struct.pack("<I4s", len(part), kind) + part for part, kind in ((text, b"JSON"), (content, b"BIN\0"))
+    )
+    body = b"".join(parts)
+    path.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(body)) + body)
+
+
+def test_a_glb_that_keeps_an_spz_holds_what_the_spz_holds(tmp_path):
+    write_splats(tmp_path / "a.spz", some_splats())
+    nested = {"KHR_gaussian_splatting_compression_spz_2": {"bufferView": 0}}
+    glb_of(tmp_path / "a.glb", {"extensions": nested}, content=(tmp_path / "a.spz").read_bytes())
+    found, wanted = read_splats(tmp_path / "a.glb"), read_splats(tmp_path / "a.spz")
+    for name in ("means", "scales", "opacities", "harmonics", "quats", "antialiased"):
+        assert torch.equal(torch.as_tensor(getattr(found, name)), torch.as_tensor(getattr(wanted, name)))
+
+
+@pytest.mark.parametrize(
+    ("extension", "attributes", "told"),
+    [
+        ({"extensions": {"KHR_gaussian_splatting_lgsc": {"bufferView": 0}}}, {}, "by KHR_.*_lgsc"),
+        ({}, {"POSITION": 0, "_SCALE": 1}, "a draft"),
+        ({"extensions": {"KHR_gaussian_splatting_compression_spz_2": {"bufferView": 0}}}, {}, "damaged"),
+    ],
+)  # fmt: skip
+def test_what_a_glb_has_instead_of_known_splats_is_named(extension, attributes, told, tmp_path):
+    glb_of(tmp_path / "a.glb", extension, attributes, b"\x1f\x8b")
+    with pytest.raises(UserError, match=told):
+        read_splats(tmp_path / "a.glb")
+
+
 def thing(number: int, word: str, rows: list[int], size: float) -> Thing:
     box = np.array([1.0, 2, 3]), np.eye(3), np.full(3, size)
     return Thing(number, word, 0.75, 3, *box, np.array(rows))

@@ -1,6 +1,7 @@
 """Finding a run from a folder above it."""
 
 import os
+import shutil
 
 import pytest
 
@@ -28,6 +29,18 @@ def runs(tmp_path, monkeypatch):
 def test_the_newest_under_outputs_is_found(runs):
     assert find_config().resolve() == runs[1]
     assert find_config("outputs").resolve() == runs[1]
+
+
+def test_the_newest_is_the_one_that_began_last_also_in_a_copy_and_is_named(runs, tmp_path, capsys):
+    """A copy's files are of the moment when they were copied, in any order."""
+    for day, time in (("2026-03-01_101500", 1), ("2026-02-28_235959", 9e8), ("2025-12-31_000000", 2)):
+        folder = runs[0].parent.with_name(day)
+        shutil.copytree(runs[0].parent, folder)
+        os.utime(folder / "config.yml", (time, time))
+    assert find_config().parent.name == "2026-03-01_101500"
+    assert "a/lang3dxl/2026-03-01_101500, the newest of 5 runs in outputs" in capsys.readouterr().out
+    find_config(runs[1].parent)  # the only one there
+    assert not capsys.readouterr().out
 
 
 def test_a_folder_names_its_own_runs(runs, tmp_path):

@@ -184,7 +184,7 @@ def test_listed_photos_and_no_others_are_held_out(scene, tmp_path):
 
 
 def test_a_listed_photo_that_is_not_there_is_named(scene, tmp_path):
-    with pytest.raises(UserError, match="names photo_099, which fits 0 photos"):
+    with pytest.raises(UserError, match=r"names \['photo_099'\], which fits no photo"):
         split(scene, "photo_099\n", tmp_path)
 
 

@@ -102,6 +102,35 @@ def test_a_signal_while_training_saves_and_tells_the_shell(trained, monkeypatch,
     assert [path.name for path in folders[0].glob("*")] == ["step-000000001.ckpt"]
 
 
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_the_viewer_of_a_finished_run_without_a_word(trained, monkeypatch, number):
+    run, folders = trained
+    told = []
+    monkeypatch.setattr(
+        Lang3DXLTrainer, "_train_complete_viewer", lambda _: (signal.raise_signal(number), told.append(1))
+    )
+    run(semantics=False, viewer__quit_on_train_completion=False)
+    assert not told  # it would have gone on for ever
+    assert list(folders[0].parent.glob("*.scene"))
+
+
+def test_a_signal_while_a_finished_run_is_saved_leaves_its_scene(trained, monkeypatch):
+    run, folders = trained
+    save = Lang3DXLTrainer.save_checkpoint
+
+    def signaled(self, step):
+        if self.training_state == "completed":
+            signal.raise_signal(signal.SIGINT)
+        save(self, step)
+
+    monkeypatch.setattr(Lang3DXLTrainer, "save_checkpoint", signaled)
+    monkeypatch.setattr(Lang3DXLTrainer, "_train_complete_viewer", lambda _: pytest.fail("waits for another"))
+    with pytest.raises(SystemExit) as end:
+        run(semantics=False, viewer__quit_on_train_completion=False)
+    assert end.value.code == 130
+    assert list(folders[0].parent.glob("*.scene"))
+
+
 def test_handlers_that_python_did_not_install_are_no_trouble(trained, monkeypatch):
     run, _ = trained
     monkeypatch.setattr(signal, "getsignal", lambda _: None)
