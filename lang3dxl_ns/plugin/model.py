@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -28,7 +29,10 @@ from lang3dxl_ns.plugin.inert_settings import OF_SPLATFACTO
 from lang3dxl_ns.plugin.splatfacto import SplatfactoModel, SplatfactoModelConfig
 from lang3dxl_ns.preparation.targets import FACTS, Batch, SceneFacts, foreground
 from lang3dxl_ns.query.question import Question, pictures
+from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.rendering import Rendering
+from lang3dxl_ns.things.find import Things, things_of
+from lang3dxl_ns.things.write import outlined
 from lang3dxl_ns.training.conversation import Conversation
 from lang3dxl_ns.training.parts import CameraRefinement
 from lang3dxl_ns.training.settings import TrainingSettings
@@ -55,6 +59,7 @@ class Lang3DXLModelConfig(TrainingSettings, SplatfactoModelConfig):  # type: ign
 class RenderedAnswers:
     """The outputs that `ns-render` adds to every rendering, as a viewer's `Conversation` does."""
 
+    scene: Scene
     question: Question
     shows_bottleneck: bool = True
 
@@ -62,9 +67,15 @@ class RenderedAnswers:
         """Return the values that Gaussians carry in a rendering."""
         return self.question.channels
 
+    @cached_property
+    def things(self) -> list[Things]:
+        """The single things that the question names, found once."""
+        return things_of(self.scene, self.question)
+
     def outputs(self, rendering: Rendering, seconds: float) -> dict[str, Tensor]:
-        """Return the outputs that answer the question."""
-        return pictures(rendering, self.question)
+        """Return the outputs that answer the question, and `things`: their numbered outlines."""
+        outlines = torch.tensor(outlined(rendering, self.things) / 255.0).to(rendering.rgb)
+        return pictures(rendering, self.question) | {"things": outlines}
 
 
 class Lang3DXLModel(SplatfactoModel):

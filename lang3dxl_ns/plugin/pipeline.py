@@ -109,7 +109,7 @@ class Lang3DXLPipeline(VanillaPipeline):
             cache = None if run is None else run / "lang3dxl_visible.safetensors"
             CONSOLE.log(f"Looking for {escape(self.query)}")
             scene = snapshot(self.model.run, self.scene_file, cache=cache)
-            self.model.answers = RenderedAnswers(scene.ask(self.query))
+            self.model.answers = RenderedAnswers(scene, scene.ask(self.query))
 
     def learn_words(self) -> None:
         """Gather the training photos' features onto the present Gaussians, and learn codes."""

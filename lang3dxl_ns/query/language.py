@@ -32,10 +32,8 @@ class Meaning:
     @property
     def advice(self) -> list[str]:
         """Sentences about the unused parts."""
-        told = TABLE["unused"]
-        return [
-            told[kind].replace("{target}", self.target).replace("{part}", part) for kind, part in self.unused
-        ]
+        told = ((TABLE["unused"][kind], part) for kind, part in self.unused)
+        return [text.replace("{target}", self.target).replace("{part}", part) for text, part in told]
 
 
 def phrases_of(typed: str, names: Iterable[str] = ()) -> list[tuple[str, list[str]]]:

@@ -75,7 +75,6 @@ def _words(text: str) -> list[str]:
 def singulars(words: str) -> list[str]:
     """Return a word or term without punctuation, and those that it may be the plural of."""
     endings = (("s", ""), ("es", ""), ("ies", "y"), ("ves", "f"), ("es", "is"), ("ia", "ion"), ("a", "um"))
-    irregular = {"oculi": "oculus", "abaci": "abacus"}
     words = words.strip(".,;:!?'\"()")
     forms = [words.removesuffix(plural) + one for plural, one in endings if words.endswith(plural)]
-    return [words, *forms, irregular.get(words, words)]
+    return [words, *forms, {"oculi": "oculus", "abaci": "abacus"}.get(words, words)]

@@ -321,23 +321,16 @@ class Scene:
         solid = self.floating <= FLOATS if hide_floaters else None
         if text is None:
             return write_splats(path, splats if solid is None else splats.select(solid), place=place)
-        return write_matching(
-            path, splats, asking.ask_one(self, text, threshold), everything, index, solid, place
-        )
+        question = asking.ask_one(self, text, threshold)
+        return write_matching(path, splats, question, everything, index, solid, place)
 
     # ── what the photos show ────────────────────────────────────────────────────────────────────────
 
     @cached_property
     def visible(self) -> Mapping[str, VisibleGaussians]:
         """The Gaussians visible in each training view. They are measured once, with a progress bar."""
-        return measured(
-            self.file,
-            self.splats,
-            self.config.views,
-            self.config.view_side,
-            cache=self.cache,
-            watch=self.watch,
-        )
+        size = self.config.views, self.config.view_side
+        return measured(self.file, self.splats, *size, cache=self.cache, watch=self.watch)
 
     @cached_property
     def mass(self) -> Float[Tensor, " n"]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
@@ -35,7 +35,7 @@ _CELL = 1 / 8
 """Side of the cells in which Gaussians are grouped as one, relative to the gap between groups."""
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True)
 class Box:
     """An axis-aligned box in the model's frame."""
 
@@ -44,23 +44,19 @@ class Box:
     share: float
     """Share of the total match weight that this box's group holds, 0…1."""
 
-    def __repr__(self) -> str:
-        low, high = (tuple(round(x, 3) for x in corner) for corner in (self.low, self.high))
-        return f"Box({low} to {high}, {self.share:.0%} of the match)"
-
     @property
     def center(self) -> tuple[float, ...]:
         """Center of the box."""
         return tuple((a + b) / 2 for a, b in zip(self.low, self.high, strict=True))
 
 
-@dataclass(frozen=True, eq=False, repr=False)
+@dataclass(frozen=True, eq=False)
 class Viewpoint:
     """A training camera that shows a match."""
 
     name: str
     """Name of the training photo."""
-    camera: Camera
+    camera: Camera = field(repr=False)
     area: float
     """Share of the view that matches."""
     score: float
@@ -69,9 +65,6 @@ class Viewpoint:
     """How well the view shows the match, 0…1: closeness to the scene's highest peak × size × centering."""
     shown: bool
     """Whether the match fills at least one pixel."""
-
-    def __repr__(self) -> str:
-        return f"Viewpoint({self.name!r}, rank {self.rank:.2f}, {self.area:.1%} of it matches)"
 
 
 def strongest_match(
@@ -189,7 +182,6 @@ def _centeredness(view: VisibleGaussians, means: Float[Tensor, "n 3"]) -> Float[
     points = in_camera_frame(camera, means[view.rows])
     (fx, _, cx), (_, fy, cy), _ = camera.intrinsics.tolist()
     x, y = (points[:, axis] / points[:, 2] for axis in (0, 1))
-    off = torch.maximum(
-        (2 * (x * fx + cx) / camera.width - 1).abs(), (2 * (y * fy + cy) / camera.height - 1).abs()
-    )
+    across, down = 2 * (x * fx + cx) / camera.width - 1, 2 * (y * fy + cy) / camera.height - 1
+    off = torch.maximum(across.abs(), down.abs())
     return 1 - (1 - RIM) * ((off - 0.5) / 0.5).nan_to_num(1.0).clamp(0, 1)

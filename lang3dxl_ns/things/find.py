@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -31,6 +32,8 @@ PAIRED, NEIGHBORS = 1_000, 3.0
 distance, relative to the gap between groups."""
 _KNOWN: WeakKeyDictionary[Answering, list[Thing]] = WeakKeyDictionary()
 """Things that were found in each scene so far: they keep their ids."""
+SURE = 0.6
+"""Number of views, relative to the typical thing's, above which a thing is sure."""
 SAME = 0.5
 """Overlap (intersection over union of weights) from which two words' things are one."""
 
@@ -48,8 +51,8 @@ class Things:
 
     @property
     def sure(self) -> list[Thing]:
-        """Those of the things that three or more photos show, and half as many as show the typical one."""
-        often = max(VIEWS, float(np.median([thing.views for thing in self.things] or [0])) / 2)
+        """Those of the things that three or more photos show, and over .6 as many as show the typical one."""
+        often = max(VIEWS, SURE * float(np.median([thing.views for thing in self.things] or [0])))
         return [thing for thing in self.things if thing.views > often]
 
     @property
@@ -74,8 +77,7 @@ def things_of(scene: Answering, question: Question) -> list[Things]:
 
     Every training view's heat map falls into pieces (`pieces_of`), and pieces of several views are one thing
     where they share Gaussians (`join`). Where a prompt's colors differ from those around it, colors separate
-    neighbors: the wall between two windows that CLIP sees as one. A thing that an earlier question to this
-    scene found keeps its id.
+    neighbors: the wall between two windows that CLIP sees as one. A thing keeps its id in later questions.
     """
     mass = scene.mass.double().cpu().numpy()
     means, axes = scene.splats.means.double().cpu().numpy(), axes_of(scene)
@@ -87,17 +89,18 @@ def things_of(scene: Answering, question: Question) -> list[Things]:
         for found, shown, there in zip(pieces, views, present, strict=True):
             found += pieces_of(shown) if there else []
 
-    def box(one: Joined, weight: Float[Array, " n"]) -> Box:
+    def box(weight: Float[Array, " n"], one: Joined) -> Box:
         return upright_box(means[one.rows], weight[one.rows], axes)
 
     answers, known = list[Things](), _KNOWN.setdefault(scene, [])
     for i, prompt in enumerate(question.prompts):
         values = question.relevancy[i].double().cpu().numpy()
         weight = np.sqrt(mass) * values
-        parts = join(pieces[i], weight)
-        joined = grown(stacked(parts, [box(part, weight) for part in parts]), len(weight))
+        boxed = partial(box, weight)
+        parts = join(pieces[i], weight, boxed)
+        joined = grown(stacked(parts, [boxed(part) for part in parts]), len(weight))
         sure = [one for one in without_crumbs(joined) if one.views >= VIEWS]
-        listed = [_known(_thing(prompt.text, one, box(one, weight), mass, values), known, mass)
+        listed = [_known(_thing(prompt.text, one, boxed(one), mass, values), known, mass)
                   for one in [*sure, *(one for one in joined if one not in sure)]]  # fmt: skip
         things, candidates = listed[: len(sure)], listed[len(sure) :]
         known += [thing for thing in things if all(thing.id != other.id for other in known)]
@@ -130,8 +133,7 @@ def axes_of(scene: Answering) -> Float[Array, "3 3"]:
 
 
 def _sharpened(scene: Answering, relevancy: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
-    """Multiply relevancies by how much a Gaussian's color is that of the matches, and not of what is around
-    them."""
+    """Multiply relevancies by how much a Gaussian's color is that of the matches, not of what is around."""
     from scipy.spatial import KDTree
     from sklearn.linear_model import LogisticRegression  # imported here, since the import takes a second
 

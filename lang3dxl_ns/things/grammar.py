@@ -169,13 +169,11 @@ def unsure(request: Request, found: Sequence[Things], sight: Facing) -> str | No
     known roughly: where the next thing is nearly as large, either may be the largest.
     """
 
-    def with_things(one: Things, things: list[Thing]) -> list[Things]:
-        return [replace(other, things=things) if other is one else other for other in found]
-
     wide = []
     for one in (one for one in found if one.word in request.words):
         ways = (one.things, one.sure, [*one.things, *one.candidates])
-        if len({_told(request, with_things(one, things), sight) for things in ways}) > 1:
+        each = [[replace(other, things=some) if other is one else other for other in found] for some in ways]
+        if len({_told(request, listed, sight) for listed in each}) > 1:
             wide.append(f"{one.word}: {one.count}")
     return ", ".join(wide) or _close(request, found, sight)
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Sequence
+from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations, pairwise
 
@@ -25,8 +25,10 @@ VIEWS = 2
 CRUMB = 0.03
 """Weight, relative to the typical thing's (half of all weight is in heavier ones), below which a thing is a
 crumb of another, unless many views show it."""
-OFTEN = 8
+OFTEN = 5
 """Number of views that show a thing from which it is no crumb, however small: a pinnacle beside a spire."""
+OVER = 0.6
+"""Level distance of two things, relative to their summed widths, up to which one stands over the other."""
 SLIM = 4.0
 """Height, relative to its width, from which a thing is one with what stands on or below it."""
 STRAIGHT = 1.5
@@ -49,16 +51,19 @@ class Joined:
         return len({piece.photo for piece in self.votes})
 
 
-def join(pieces: Sequence[Piece], weight: Float[Array, " n"]) -> list[Joined]:
+def join(pieces: Sequence[Piece], weight: Float[Array, " n"], box: Callable[[Joined], Box]) -> list[Joined]:
     """Join the pieces of all views, from the finest resolution to the coarsest.
 
     A piece founds a thing if its Gaussians are mostly free, confirms the thing that it shares most with, and
-    says nothing if it covers several things (a coarse view joins neighbors that a fine one tells apart), or
-    if it is cut off and new. A thing is one with the heavier one that most pieces cover together with it and
-    no photo shows apart from it: two sides of a tower. `weight` is each Gaussian's weight, 0 and above.
+    says nothing if it covers several things, which a finer view told apart, or if it is cut off and new. A
+    thing is one with the heavier one that most photos cover together with it (two sides of a tower), unless a
+    photo shows each alone, or shows both in two pieces and neither stands over the other (a spire and a
+    pinnacle). `weight`: of each Gaussian, 0 and above; `box`: of a thing.
     """
     owner, things = np.full(len(weight), -1), list[Joined]()
-    together = Counter[tuple[int, int]]()
+    seen = defaultdict[tuple[int, ...], set[str]](
+        set
+    )  # photos that show a thing, and those of two in one piece
     for piece in sorted(pieces, key=lambda piece: (piece.cut, -piece.resolution)):
         mine, total = owner[piece.rows], weight[piece.rows].sum()
         if total <= 0:
@@ -66,29 +71,41 @@ def join(pieces: Sequence[Piece], weight: Float[Array, " n"]) -> list[Joined]:
         shared = np.bincount(mine[mine >= 0], weight[piece.rows][mine >= 0], minlength=len(things))
         of_things = shared / np.array([thing.weight for thing in things]) if things else shared
         covered = np.flatnonzero(of_things > SHARED).tolist()
-        if len(covered) > 1:
-            together.update(combinations(covered, 2))
-            continue
-        best = int(shared.argmax()) if things else -1
-        if things and (shared[best] > SHARED * total or of_things[best] > SHARED):
+        best, single = int(shared.argmax()) if things else -1, len(covered) < 2
+        if single and things and (shared[best] > SHARED * total or of_things[best] > SHARED):
             if of_things[best] >= SPLINTER and not (piece.cut and of_things[best] <= SHARED):
                 things[best].votes.append(piece)
-        elif not piece.cut and shared.sum() <= SHARED * total:
+                covered = [best]
+        elif single and not piece.cut and shared.sum() <= SHARED * total:
             rows = piece.rows[mine < 0]
-            owner[rows] = len(things)
+            owner[rows], covered = len(things), [len(things)]
             things.append(Joined(rows, float(weight[rows].sum()), [piece]))
-    return [thing for thing in _united(things, together) if len(thing.rows) > 1]
+        for some in (*combinations(covered, 1), *combinations(covered, 2)):
+            seen[some].add(piece.photo)
+    return [thing for thing in _united(things, seen, box) if len(thing.rows) > 1]
 
 
-def _united(things: Sequence[Joined], together: Counter[tuple[int, int]]) -> list[Joined]:
-    photos = [{piece.photo for piece in thing.votes} for thing in things]
+def _united(
+    things: Sequence[Joined], seen: Mapping[tuple[int, ...], set[str]], box: Callable[[Joined], Box]
+) -> list[Joined]:
+    alone = [{piece.photo for piece in thing.votes} for thing in things]
     best: dict[int, tuple[int, int]] = {}
     # One partner each: crumbs between two towers would otherwise make one of them.
-    for pair, times in sorted(together.items()):
+    for pair, photos in sorted(item for item in seen.items() if len(item[0]) == 2):
         heavy, light = sorted(pair, key=lambda i: (-things[i].weight, i))
-        if not photos[heavy] & photos[light] and times > best.get(light, (0, 0))[0]:
-            best[light] = times, heavy
-    return _grouped(things, [(light, heavy) for light, (_, heavy) in best.items()])
+        if not alone[heavy] & alone[light] and len(photos) > best.get(light, (0, 0))[0]:
+            best[light] = len(photos), heavy
+    pairs = [(light, heavy) for light, (_, heavy) in best.items()]
+    never_apart = [(a, b) for a, b in pairs if seen[a,] & seen[b,] <= seen[min(a, b), max(a, b)]]
+    group = _groups(len(things), never_apart)
+    boxes = [box(one) for one in _grouped(things, group)]
+    pairs = [(a, b) for a, b in pairs if _over(boxes[group[a]], boxes[group[b]])]
+    return _grouped(things, _groups(len(things), pairs))
+
+
+def _over(one: Box, other: Box) -> bool:
+    (center, axes, size), (place, _, extent) = one, other
+    return bool((abs(axes @ (center - place)) <= OVER * (size + extent))[:2].all())
 
 
 def grown(things: Sequence[Joined], count: int) -> list[Joined]:
@@ -118,14 +135,17 @@ def stacked(things: Sequence[Joined], boxes: Sequence[Box]) -> list[Joined]:
             aside, high = np.linalg.norm(axes[:2] @ (other - center)), abs(axes[2] @ (other - center))
             if a != b and aside < STRAIGHT * size[:2].max() and high < 1.5 * size[2] + extent[2] / 2:
                 pairs.append((a, b))
-    return _grouped(things, pairs)
+    return _grouped(things, _groups(len(things), pairs))
 
 
-def _grouped(things: Sequence[Joined], pairs: Sequence[tuple[int, int]]) -> list[Joined]:
+def _groups(count: int, pairs: Sequence[tuple[int, int]]) -> Int[Array, " n"]:
     ends = np.array(pairs).reshape(-1, 2).T.astype(int)
-    graph = coo_matrix((np.ones(ends.shape[1]), (ends[0], ends[1])), (len(things), len(things)))
-    count, group = connected_components(graph, directed=False) if things else (0, np.zeros(0))
-    parts = ([things[i] for i in np.flatnonzero(group == number)] for number in range(count))
+    graph = coo_matrix((np.ones(ends.shape[1]), (ends[0], ends[1])), (count, count))
+    return connected_components(graph, directed=False)[1] if count else np.zeros(0, int)
+
+
+def _grouped(things: Sequence[Joined], group: Int[Array, " n"]) -> list[Joined]:
+    parts = ([things[i] for i in np.flatnonzero(group == number)] for number in np.unique(group))
     return [Joined(np.concatenate([one.rows for one in of]), sum(one.weight for one in of),
                    [piece for one in of for piece in one.votes]) for of in parts]  # fmt: skip
 

@@ -7,18 +7,25 @@ import io
 import json
 from collections.abc import Sequence
 from dataclasses import asdict
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import UInt8
+from numpy import ndarray as Array
 from PIL import Image, ImageDraw
+from scipy.spatial import ConvexHull
 
 from lang3dxl_ns.common.files import make_folder, slugs, write_atomically
 from lang3dxl_ns.files.glb import encode_glb
 from lang3dxl_ns.files.splat_file import write_splats
 from lang3dxl_ns.query.heat_maps import PROMPT_COLORS
+from lang3dxl_ns.query.match import as_bytes, save_picture
 from lang3dxl_ns.query.scene import Scene
+from lang3dxl_ns.rendering import Rendering
+from lang3dxl_ns.scene.camera import in_camera_frame
 from lang3dxl_ns.things.find import Things, up_of
 from lang3dxl_ns.things.grammar import Sight, holds, sight_of
 from lang3dxl_ns.things.thing import Thing
@@ -26,6 +33,7 @@ from lang3dxl_ns.things.thing import Thing
 SIDES = {"left": "left_of", "right": "right_of", "above": "above", "below": "below"}
 SIDES |= {"front": "in_front_of", "behind": "behind"}
 """Names in the catalog of the relations between neighbors."""
+_CORNERS = np.array(list(product((-0.5, 0.5), repeat=3)))
 
 
 def write_catalog(scene: Scene, answers: Sequence[Things], folder: Path) -> None:
@@ -46,9 +54,7 @@ def write_catalog(scene: Scene, answers: Sequence[Things], folder: Path) -> None
     rows = io.StringIO()
     table = csv.writer(rows, lineterminator="\n")
     sides = ["width", "depth", "height"]
-    table.writerow(
-        ["id", "word", "score", "views", *"xyz", *sides, "photo", *(f"{side}_m" for side in sides)]
-    )
+    table.writerow(["id", "word", "score", "views", *"xyz", *sides, "photo", *(f"{s}_m" for s in sides)])
     for thing, size in zip(things, meters, strict=True):
         seen = thing.sightings[0].photo if thing.sightings else ""
         numbers = [*thing.center.round(4).tolist(), *thing.size.round(4).tolist(), seen, *(size or [""] * 3)]
@@ -91,26 +97,34 @@ def coco(scene: Scene, answers: Sequence[Things]) -> dict[str, Any]:
 
 
 def write_picture(scene: Scene, answers: Sequence[Things], path: Path) -> None:
-    """Draw numbered boxes on the rendering of the photo that shows most of the things."""
-    shown = [
-        (i, n, s) for i, one in enumerate(answers) for n, t in enumerate(one.things, 1) for s in t.sightings
-    ]
-    if not shown:
-        return
-    names = [sighting.photo for *_, sighting in shown]
-    photo = max(sorted(set(names)), key=names.count)
-    camera = scene.file.photo(photo).camera
-    view = scene.render(photo, 2 * max(camera.width, camera.height))
-    pixels = (view.rendering.rgb.clamp(0, 1) * 255).byte().cpu().numpy()
-    picture, scale = Image.fromarray(pixels), pixels.shape[1] / camera.width
-    pen = ImageDraw.Draw(picture)
-    for which, number, sighting in shown:
-        if sighting.photo == photo:
+    """Draw numbered outlines on the rendering of the photo that shows most of the things."""
+    names = [shown.photo for one in answers for thing in one.things for shown in thing.sightings]
+    if names:
+        photo = max(sorted(set(names)), key=names.count)
+        camera = scene.file.photo(photo).camera
+        view = scene.render(photo, 2 * max(camera.width, camera.height))
+        save_picture(outlined(view.rendering, answers), path)
+
+
+def outlined(rendering: Rendering, answers: Sequence[Things]) -> UInt8[Array, "h w 3"]:
+    """Draw each thing's box in its word's color, numbered, unless it lies over its size behind the view."""
+    picture, camera = Image.fromarray(as_bytes(rendering.rgb)), rendering.camera
+    pen, lens, depth = ImageDraw.Draw(picture), camera.intrinsics.cpu().numpy(), rendering.depth.cpu().numpy()
+    numbered = [(i, n, thing) for i, one in enumerate(answers) for n, thing in enumerate(one.things, 1)]
+    for which, number, thing in numbered:
+        places = np.vstack([thing.center, thing.center + (_CORNERS * thing.size) @ thing.axes])
+        seen = in_camera_frame(camera, torch.from_numpy(places)).cpu().numpy()
+        if seen[:, 2].min() < 1e-2 * thing.size.max():
+            continue  # beside the camera or behind it
+        pixels = (seen / seen[:, 2:]) @ lens[:2].T
+        x, y = pixels[0].astype(int)
+        inside = 0 <= x < camera.width and 0 <= y < camera.height
+        if inside and seen[0, 2] < depth[y, x] + thing.size.max():
+            around = pixels[1:][ConvexHull(pixels[1:], qhull_options="QJ").vertices]
             color = PROMPT_COLORS[which % len(PROMPT_COLORS)]
-            corners = [scale * value for value in sighting.box]
-            pen.rectangle(corners, outline=color, width=2)
-            pen.text((corners[0] + 3, corners[1] + 1), str(number), fill=color)
-    picture.save(path)
+            pen.polygon(around.ravel().tolist(), outline=color, width=2)
+            pen.text((x, y), str(number), color, anchor="mm", stroke_width=1, stroke_fill="white")
+    return np.asarray(picture)
 
 
 def write_things(scene: Scene, answers: Sequence[Things], folder: Path, look: str | None = None) -> int:
@@ -127,8 +141,5 @@ def write_things(scene: Scene, answers: Sequence[Things], folder: Path, look: st
 
 
 def _each_once(answers: Sequence[Things]) -> list[Thing]:
-    things: dict[int, Thing] = {}
-    for one in answers:
-        for thing in one.things:
-            things.setdefault(thing.id, thing)
-    return list(things.values())
+    things = [thing for one in answers for thing in one.things]
+    return list({thing.id: thing for thing in reversed(things)}.values())[::-1]

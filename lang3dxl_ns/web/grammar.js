@@ -2,7 +2,7 @@
 import { dot } from "./answer.js";
 import language from "./language.js";
 
-const { grammar } = language, { BESIDE, INSIDE, CLOSE, VIEWS } = language.things;
+const { grammar } = language, { BESIDE, INSIDE, CLOSE, VIEWS, SURE } = language.things;
 const has = (table, word) => Object.hasOwn(table, word);
 const any = (phrases) => [...(Array.isArray(phrases) ? phrases : Object.keys(phrases))].sort((a, b) => b.length - a.length).join("|");
 const plain = (text) => text.trim().replace(new RegExp(`^(?:(?:${any(grammar.articles)})\\s+)+`), "");
@@ -76,11 +76,11 @@ export function answerTo(request, things, view) {
   return ordered(grammar.from[along]).slice(nth - 1, nth);
 }
 
-/** Those of the things that three or more photos show, and half as many as show the typical one. */
+/** Those of the things that three or more photos show, and over .6 as many as show the typical one. */
 export function sureOf(things) {
   const seen = things.map(({ views }) => views).sort((a, b) => a - b), half = seen.length >> 1;
   const typical = seen.length ? (seen[half] + seen[seen.length - 1 - half]) / 2 : 0;
-  return things.filter(({ views }) => views > Math.max(VIEWS, typical / 2));
+  return things.filter(({ views }) => views > Math.max(VIEWS, SURE * typical));
 }
 
 /** How many there are, such as "34, perhaps 31 to 37". after: a text behind the number. */

@@ -3,7 +3,7 @@
 import language from "./language.js";
 import { fitted } from "./like.js";
 
-const { LEVELS, PART, DEPTH, FILLED, SHARED, SPLINTER, VIEWS, CRUMB, OFTEN, OUTLIERS, COLORED, SAME, SLIM, STRAIGHT } = language.things;
+const { LEVELS, PART, DEPTH, FILLED, SHARED, SPLINTER, VIEWS, CRUMB, OFTEN, OVER, OUTLIERS, COLORED, SAME, SLIM, STRAIGHT } = language.things;
 const SIDE = 240, LEAST = 3; // pixels of a view's longer side, and of the smallest piece
 const FAINT = 0.05, TRACE = 0.004, REACH = 2.5, BLUR = 0.3; // relevancy and heat that leave no trace, standard deviations that are drawn, square pixels
 const RIDGE = 0.1, ROUNDS = 12; // strength of the colors' regularization, Newton steps
@@ -14,8 +14,9 @@ const DC = 0.28209479177387814; // of spherical harmonics: colors are compared a
 export function thingsOf(views, scene, relevancy) {
   const heat = sharpened(scene, relevancy), { mass } = scene;
   const weight = Float64Array.from(relevancy, (value, i) => Math.sqrt(mass[i]) * value);
-  const parts = join(views.flatMap((view, v) => piecesOf(drawn(view, scene, heat), v)), weight);
-  const joined = grown(stacked(parts, parts.map(({ rows }) => uprightBox(rows, scene.centers, weight, scene.edges))), weight.length);
+  const box = ({ rows }) => uprightBox(rows, scene.centers, weight, scene.edges);
+  const parts = join(views.flatMap((view, v) => piecesOf(drawn(view, scene, heat), v)), weight, box);
+  const joined = grown(stacked(parts, parts.map(box)), weight.length);
   const sure = new Set(withoutCrumbs(joined).filter((one) => photosOf(one).size >= VIEWS));
   const listed = (some) => some.map((one) => described(one, scene, weight, relevancy)).sort((a, b) => b.weight - a.weight);
   return { things: listed([...sure]), candidates: listed(joined.filter((one) => !sure.has(one))) };
@@ -194,7 +195,7 @@ export function split(map, width, height, least = LEAST) {
 // ── things ──
 
 /** Join the pieces of all views, from the finest resolution to the coarsest: see things/join.py. */
-export function join(pieces, weight) {
+export function join(pieces, weight, box) {
   const owner = new Int32Array(weight.length).fill(-1), things = [], together = new Map();
   for (const piece of [...pieces].sort((a, b) => a.cut - b.cut || b.resolution - a.resolution)) {
     const shared = new Map();
@@ -206,34 +207,43 @@ export function join(pieces, weight) {
       shared.set(owner[i], (shared.get(owner[i]) ?? 0) + weight[i]);
     }
     if (!(total > 0)) continue;
-    const covered = [...shared].filter(([t, value]) => value > SHARED * things[t].weight).map(([t]) => t);
-    if (covered.length > 1) {
-      for (const a of covered) for (const b of covered) if (a < b) together.set(`${a} ${b}`, (together.get(`${a} ${b}`) ?? 0) + 1);
-      continue;
-    }
+    let covered = [...shared].filter(([t, value]) => value > SHARED * things[t].weight).map(([t]) => t);
     const [best, most] = [...shared].reduce((one, other) => (other[1] > one[1] || (other[1] === one[1] && other[0] < one[0]) ? other : one), [-1, 0]);
     const share = best < 0 ? 0 : most / things[best].weight;
-    if (best >= 0 && (most > SHARED * total || share > SHARED)) {
-      if (share >= SPLINTER && !(piece.cut && share <= SHARED)) things[best].votes.push(piece);
+    if (covered.length > 1) {
+      for (const a of covered) for (const b of covered) if (a < b) together.set(`${a} ${b}`, (together.get(`${a} ${b}`) ?? new Set()).add(piece.view));
+    } else if (best >= 0 && (most > SHARED * total || share > SHARED)) {
+      if (share >= SPLINTER && !(piece.cut && share <= SHARED)) things[(covered = [best])[0]].votes.push(piece);
     } else if (!piece.cut && taken <= SHARED * total) {
       const rows = piece.rows.filter((i) => owner[i] < 0);
       for (const i of rows) owner[i] = things.length;
-      things.push({ rows, weight: rows.reduce((sum, i) => sum + weight[i], 0), votes: [piece] });
+      covered = [things.length];
+      things.push({ rows, weight: rows.reduce((sum, i) => sum + weight[i], 0), votes: [piece], shows: new Set() });
     }
+    for (const t of covered) things[t].shows.add(piece.view);
   }
-  return united(things, together).filter(({ rows }) => rows.length > 1);
+  return united(things, together, box).filter(({ rows }) => rows.length > 1);
 }
 
-/** Unite each thing with the heavier one that most pieces cover together with it and no photo shows apart from it. */
-function united(things, together) {
-  const photos = things.map(photosOf), best = new Map();
-  const counted = [...together].map(([pair, times]) => ({ pair: pair.split(" ").map(Number), times })).sort((a, b) => a.pair[0] - b.pair[0] || a.pair[1] - b.pair[1]);
-  for (const { pair, times } of counted) {
+/** Unite each thing with the heavier one that most photos cover together with it, unless a photo shows each alone, or
+ * shows both in two pieces and neither stands over the other. */
+function united(things, together, box) {
+  const photos = things.map(photosOf), best = new Map(), both = (a, b) => [...a].filter((photo) => b.has(photo));
+  const counted = [...together].map(([pair, shown]) => ({ pair: pair.split(" ").map(Number), shown })).sort((a, b) => a.pair[0] - b.pair[0] || a.pair[1] - b.pair[1]);
+  for (const { pair, shown } of counted) {
     const [heavy, light] = pair.sort((a, b) => things[b].weight - things[a].weight || a - b);
-    if (![...photos[heavy]].some((photo) => photos[light].has(photo)) && times > (best.get(light)?.times ?? 0)) best.set(light, { times, heavy });
+    if (!both(photos[heavy], photos[light]).length && shown.size > (best.get(light)?.shown.size ?? 0)) best.set(light, { heavy, shown });
   }
-  return grouped(things, [...best].map(([light, { heavy }]) => [light, heavy]));
+  const pairs = [...best].map(([light, { heavy, shown }]) => [light, heavy, both(things[heavy].shows, things[light].shows).every((photo) => shown.has(photo))]);
+  const boxes = new Map();
+  for (const group of grouped(things, pairs.filter(([, , neverApart]) => neverApart))) {
+    const whole = box(group);
+    for (const part of group.parts) boxes.set(part, whole);
+  }
+  return grouped(things, pairs.filter(([a, b]) => isOver(boxes.get(things[a]), boxes.get(things[b]))));
 }
+
+const isOver = (a, b) => [0, 1].every((k) => Math.abs(a.axes[k].reduce((sum, value, i) => sum + value * (a.center[i] - b.center[i]), 0)) <= OVER * (a.size[k] + b.size[k]));
 
 /** Give each of count Gaussians to the thing of which most pieces show it, at least two; its founder counts twice. */
 export function grown(things, count) {
@@ -270,7 +280,7 @@ function grouped(things, pairs) {
   const groups = new Map();
   things.forEach((thing, t) => groups.set(root(t), [...(groups.get(root(t)) ?? []), thing]));
   return [...groups.values()].map((parts) => ({
-    rows: parts.flatMap(({ rows }) => rows), votes: parts.flatMap(({ votes }) => votes),
+    parts, rows: parts.flatMap(({ rows }) => rows), votes: parts.flatMap(({ votes }) => votes),
     weight: parts.reduce((sum, { weight }) => sum + weight, 0),
   })); // prettier-ignore
 }

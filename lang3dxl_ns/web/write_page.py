@@ -63,9 +63,9 @@ _SUGGESTED = (
 _NUMBERS = (
     ("ranking", view_ranking, "PEAK LARGE RIM STRONG"),
     ("things", pieces, "LEVELS PART DEPTH FILLED"),
-    ("things", join, "SHARED SPLINTER VIEWS CRUMB OFTEN SLIM STRAIGHT"),
+    ("things", join, "SHARED SPLINTER VIEWS CRUMB OFTEN OVER SLIM STRAIGHT"),
     ("things", thing, "OUTLIERS"),
-    ("things", find, "COLORED SAME"),
+    ("things", find, "COLORED SAME SURE"),
     ("things", grammar, "BESIDE INSIDE CLOSE"),
 )
 """Numbers that rank views, tell things apart and relate them, by the modules that hold them."""

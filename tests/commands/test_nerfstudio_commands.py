@@ -98,18 +98,18 @@ def test_render_shows_what_is_asked_for(run, folder, camera_path, monkeypatch, v
     }[views]
     command(
         *("ns-render", views, "--load-config", run / "config.yml", "--output-path", target, *words),
-        *("--rendered-output-names", "rgb", "relevancy_0", "relevancy_1", "overlay", "bottleneck"),
+        *("--rendered-output-names", "rgb", "relevancy_0", "relevancy_1", "overlay", "bottleneck", "things"),
         cwd=folder,
     )
     pictures = sorted(path.relative_to(target) for path in target.rglob("*.jpg"))
     if views == "dataset":  # a folder per output
-        outputs = {"rgb", "relevancy_0", "relevancy_1", "overlay", "bottleneck"}
+        outputs = {"rgb", "relevancy_0", "relevancy_1", "overlay", "bottleneck", "things"}
         assert {path.parts[1] for path in pictures} == outputs
     else:  # the outputs side by side
         with Image.open(target / pictures[0]) as picture:
-            assert picture.width % 5 == 0 and picture.width > picture.height
+            assert picture.width % 6 == 0 and picture.width > picture.height
     if views == "camera-path":
-        assert len(pictures) == 2 and picture.size == (5 * 48, 32)
+        assert len(pictures) == 2 and picture.size == (6 * 48, 32)
 
 
 def test_export_splat(run, folder):

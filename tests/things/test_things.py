@@ -15,13 +15,14 @@ from lab.landmark.instances import true_things
 from lab.landmark.landmark import Landmark
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.query.trust import FAR
+from lang3dxl_ns.rendering import Camera, Rendering
 from lang3dxl_ns.scene.georeference import Georeference
 from lang3dxl_ns.things.find import Things, axes_of, up_of
 from lang3dxl_ns.things.grammar import Request, Sight, answer, parse, sight_of, table, unsure
 from lang3dxl_ns.things.join import OFTEN, Joined, grown, join, stacked, without_crumbs
 from lang3dxl_ns.things.pieces import Piece, Shown, pieces_of, split
 from lang3dxl_ns.things.thing import Thing, upright_box
-from lang3dxl_ns.things.write import write_catalog
+from lang3dxl_ns.things.write import outlined, write_catalog
 
 SIGHT = Sight(np.array([1.0, 0, 0]), np.array([0, 0, 1.0]), np.array([0, 1.0, 0]))
 
@@ -34,6 +35,12 @@ def bumps(*columns: int) -> np.ndarray:
 
 def piece(photo: str, rows, resolution: float, cut: bool = False) -> Piece:
     return Piece(photo, np.array(rows), resolution, len(rows), (0, 0, 9, 9), cut)
+
+
+def joined(pieces, places=range(300)) -> list[Joined]:
+    """Join pieces of Gaussians of equal weight at these places along x."""
+    points, weight = np.outer(places, (1.0, 0, 0)), np.ones(len(places))
+    return join(pieces, weight, lambda one: upright_box(points[one.rows], weight[one.rows], np.eye(3)))
 
 
 def thing(number: int, word: str, center, size=(1.0, 1.0, 1.0), views: int = 3) -> Thing:
@@ -63,16 +70,28 @@ def test_hidden_gaussians_belong_to_no_piece():
 def test_a_coarse_view_does_not_join_what_a_fine_one_tells_apart():
     fine = [piece(p, rows, 9.0) for p in "ab" for rows in ([0, 1, 2], [3, 4, 5])]
     coarse = [piece(p, range(6), 1.0) for p in "cdefg"]
-    found = join([*coarse, *fine], np.ones(6))
+    found = joined([*coarse, *fine])
     assert sorted(sorted(one.rows.tolist()) for one in found) == [[0, 1, 2], [3, 4, 5]]
     assert [one.views for one in found] == [2, 2]
 
 
 def test_sides_that_no_photo_shows_apart_are_one_thing():
     sides = [piece("a", [0, 1, 2], 9.0), piece("b", [3, 4, 5], 9.0)]
-    assert len(join(sides, np.ones(6))) == 2
-    (one,) = join([*sides, piece("c", range(6), 1.0)], np.ones(6))
+    assert len(joined(sides)) == 2
+    (one,) = joined([*sides, piece("c", range(6), 1.0)])
     assert sorted(one.rows.tolist()) == list(range(6))
+
+
+@pytest.mark.parametrize("beside", [True, False])
+def test_what_stands_beside_is_another_thing_where_a_photo_has_them_in_two_pieces(beside):
+    spire, pinnacle, other = range(10), range(10, 15), range(15, 25)
+    alone = [piece(p, rows, 9.0) for p, rows in zip("abc", (spire, pinnacle, other), strict=True)]
+    both = [piece("d", [*spire, *pinnacle], 1.0), piece("e", [*spire, *pinnacle], 1.0)]
+    # This photo has the spire and what is behind it in one piece, and the pinnacle in another.
+    apart = [piece("f", [*spire, *other], 1.0), piece("f", pinnacle, 1.0)]
+    places = np.r_[0:10, 20:25, 0:10] if beside else np.r_[0:10, 2:7, 0:10]
+    assert len(joined([*alone, *both], places)) == 2
+    assert len(joined([*alone, *both, *apart], places)) == (2 if beside else 1)
 
 
 def test_crumbs_between_two_towers_do_not_make_one_of_them():
@@ -83,7 +102,7 @@ def test_crumbs_between_two_towers_do_not_make_one_of_them():
         piece("e", [*left, *crumb], 2.0),
         piece("f", [*right, *crumb], 2.0),
     ]
-    found = join([*alone, *both], np.ones(22))
+    found = joined([*alone, *both])
     assert sorted(sorted(one.rows.tolist()) for one in found) == [[*left, *crumb], [*right]]
 
 
@@ -94,14 +113,14 @@ def test_a_thing_gets_the_gaussians_that_most_of_its_pieces_show():
         piece("e", [1, 2, 4], 5.0),
     ]
     beside = [piece("a", [5, 6, 7], 9.0), piece("b", [3, 5, 6, 7], 5.0)]
-    found = grown(join([*shown, *beside], np.ones(9)), 9)
+    found = grown(joined([*shown, *beside]), 300)
     assert [sorted(one.rows.tolist()) for one in found] == [[0, 1, 2, 3], [5, 6, 7]]
     assert grown([], 9) == []
 
 
 def test_crumbs_go_and_equals_stay():
     sizes = [np.arange(100), np.arange(100, 200), np.arange(200, 202)]
-    found = without_crumbs(join([piece("a", rows, 1.0) for rows in sizes], np.ones(202)))
+    found = without_crumbs(joined([piece("a", rows, 1.0) for rows in sizes]))
     assert [len(one.rows) for one in found] == [100, 100]
     assert without_crumbs([]) == []
 
@@ -110,7 +129,7 @@ def test_many_views_tell_that_a_small_thing_is_no_crumb():
     sizes = [np.arange(100), np.arange(100, 102), np.arange(102, 104)]
     shown = [piece(str(v), rows, 1.0) for rows, n in zip(sizes, (2, OFTEN, OFTEN - 1), strict=True)
              for v in range(n)]  # fmt: skip
-    found = without_crumbs(join(shown, np.ones(104)))
+    found = without_crumbs(joined(shown))
     assert [len(one.rows) for one in found] == [100, 2]
     assert 100 in found[1].rows
 
@@ -247,6 +266,20 @@ def test_the_catalog_names_the_nearest_neighbors_and_what_is_in_what(tmp_path):
     assert [1, other, 0] in graph
     assert [0, side, 2] not in graph  # the one between is nearer
     assert [1, side, 2] in graph
+
+
+def test_outlines_are_drawn_around_what_a_view_shows_and_not_around_what_it_hides():
+    camera = Camera(torch.eye(4), torch.tensor([[50.0, 0, 50], [0, 50.0, 40], [0, 0, 1]]), 100, 80)
+    wall = Rendering(camera, torch.full((80, 100, 3), 0.5), torch.ones(80, 100), torch.full((80, 100), 5.0))
+    shown = thing(1, "window", (1, 0, 5), (1.0, 2.0, 0.2))
+    others = [thing(2, "window", (-2, 0, 7)), thing(3, "window", (0, 0, -5)), thing(4, "window", (9, 0, 5))]
+    plain = outlined(wall, [])
+    assert (plain == 128).all()
+    assert (outlined(wall, [Things("window", others)]) == plain).all()  # behind the wall, behind us, aside
+    rows, columns = (outlined(wall, [Things("window", [shown, *others])]) != plain).any(2).nonzero()
+    # Its front side is 4.9 away: 10.2 by 20.4 pixels around column 60 and row 40.
+    assert [columns.min(), columns.max()] == pytest.approx([55, 65], abs=1.5)
+    assert [rows.min(), rows.max()] == pytest.approx([29.8, 50.2], abs=1.5)
 
 
 @pytest.mark.parametrize("known", [True, False])

@@ -134,13 +134,30 @@ def test_pieces_join_as_in_python(page):
             rows = np.unique(rng.integers(start, min(start + wide, 200), 30))
             cut = bool(rng.random() < 0.1)
             pieces.append(Piece(str(view), rows, float(rng.random()), len(rows), (0, 0, 1, 1), cut))
-    weight = rng.random(200)
-    expected = grown(without_crumbs(join(pieces, weight)), 200)
+    weight, points = rng.random(400), rng.random((400, 3))
+    # Two that photos have in one piece, and another in two, are one where one stands over the other.
+    for start in range(200, 400, 10):
+        spire, pinnacle, other = (range(start + a, start + b) for a, b in ((0, 4), (4, 7), (7, 10)))
+        points[pinnacle] += (rng.uniform(0, 3), 0, 0)
+        shown = [("0", spire), ("1", pinnacle), ("2", other), ("3", [*spire, *pinnacle])]
+        shown += [("4", [*spire, *pinnacle]), ("5", [*spire, *other]), ("5", pinnacle)]
+        for photo, rows in shown:
+            fine = 9.0 if photo < "3" else 0.5
+            pieces.append(Piece(photo, np.array(rows), fine, len(rows), (0, 0, 1, 1), False))
+
+    def box(one: Joined):
+        return upright_box(points[one.rows], weight[one.rows], np.eye(3))
+
+    expected = grown(without_crumbs(join(pieces, weight, box)), 400)
     given = [{"view": int(p.photo), "rows": p.rows.tolist(), "resolution": p.resolution, "cut": p.cut}
              for p in pieces]  # fmt: skip
-    body = """return m.grown(m.withoutCrumbs(m.join(given.pieces, given.weight)), 200).map(
+    body = """const edges = [[1, 0, 0], [0, 1, 0], [0, 0, 1]];
+      const box = ({ rows }) => m.uprightBox(rows, given.points, given.weight, edges);
+      return m.grown(m.withoutCrumbs(m.join(given.pieces, given.weight, box)), 400).map(
       ({ rows, votes }) => [rows.toSorted((a, b) => a - b), new Set(votes.map(({ view }) => view)).size]);"""
-    found = module(page, "things", body, {"pieces": given, "weight": weight.tolist()})
+    found = module(
+        page, "things", body, {"pieces": given, "weight": weight.tolist(), "points": points.ravel().tolist()}
+    )
     assert len(found) > 5
     assert sorted(found) == sorted([sorted(one.rows.tolist()), one.views] for one in expected)
 
