@@ -19,7 +19,7 @@ from lang3dxl_ns.files.glb import encode_glb
 from lang3dxl_ns.files.splat_file import write_splats
 from lang3dxl_ns.query.heat_maps import PROMPT_COLORS
 from lang3dxl_ns.query.scene import Scene
-from lang3dxl_ns.things.find import Things, up_of
+from lang3dxl_ns.things.find import Things, heights_of, up_of
 from lang3dxl_ns.things.grammar import Sight, holds, sight_of
 from lang3dxl_ns.things.thing import Thing
 
@@ -40,15 +40,17 @@ def write_catalog(scene: Scene, answers: Sequence[Things], folder: Path) -> None
     place = scene.file.georeference
     meters = [None if place is None else (place.meters * t.size).round(2).tolist() for t in things]
     listed = [t.as_json() | {"meters": size} for t, size in zip(things, meters, strict=True)]
-    content = {"words": words, "things": listed, "relations": graph, "up": up_of(scene).tolist()}
-    content["unit"] = None if place is None else asdict(place)
+    (ground, top), up = heights_of(scene).tolist(), up_of(scene)
+    unit = 1 / max(top - ground, 1e-9) if place is None else place.meters
+    for thing, told in zip(things, listed, strict=True):
+        told["above_ground"] = round(unit * (float(thing.center @ up) - ground), 3)
+    content = {"words": words, "things": listed, "relations": graph, "heights": [ground, top]}
+    content |= {"up": up.tolist(), "unit": None if place is None else asdict(place)}
     write_atomically(folder / "things.json", json.dumps(content, indent=1) + "\n")
     rows = io.StringIO()
     table = csv.writer(rows, lineterminator="\n")
-    sides = ["width", "depth", "height"]
-    table.writerow(
-        ["id", "word", "score", "views", *"xyz", *sides, "photo", *(f"{side}_m" for side in sides)]
-    )
+    sides, other = ["width", "depth", "height"], ["width_m", "depth_m", "height_m"]
+    table.writerow(["id", "word", "score", "views", *"xyz", *sides, "photo", *other])
     for thing, size in zip(things, meters, strict=True):
         seen = thing.sightings[0].photo if thing.sightings else ""
         numbers = [*thing.center.round(4).tolist(), *thing.size.round(4).tolist(), seen, *(size or [""] * 3)]

@@ -27,17 +27,6 @@ function judged([text, ...negatives], threshold) {
   return answers.verdict(relevancy, { strict: Boolean(negatives.length || text.taught), doubt: text.taught?.doubt, threshold, name: text.name });
 }
 
-/** Compute which Gaussians may match: 1 where any of these prompts does; null without prompts. */
-async function foregroundOf(prompts) {
-  if (!prompts.length) return null;
-  const mask = new Uint8Array(about.words.count);
-  for (const phrases of prompts) {
-    const { relevancy, threshold } = judged((await understood(phrases)).found);
-    relevancy.forEach((value, i) => (mask[i] ||= value > threshold));
-  }
-  return mask;
-}
-
 async function file(name) {
   const answer = await fetch(about.files?.[name] ?? name);
   if (!answer.ok) throw new Error(`${name} is missing (${answer.status})`);
@@ -102,7 +91,7 @@ const jobs = {
     }));
     mass = massOf(views, words.count);
     known = new Known(mass);
-    answers.foreground = await foregroundOf(about.foreground);
+    answers.foreground = about.foreground.length ? new Uint8Array(await bytes("foreground.bin")) : null;
     return vocabulary.listed;
   },
 
@@ -163,7 +152,7 @@ const jobs = {
       covered += weight;
     }
     if (covered < about.words.covered) return { words: [], rows: [] };
-    return { words: answers.naming(blend, most), rows: [...new Set(hits.sort((a, b) => b[1] - a[1]).slice(0, EXAMPLE).map(([id]) => gaussian(id).root))] };
+    return { point: inWorld(middleOf(hits)), words: answers.naming(blend, most), rows: [...new Set(hits.sort((a, b) => b[1] - a[1]).slice(0, EXAMPLE).map(([id]) => gaussian(id).root))] };
   },
 
   /** Hide the Gaussians that float more than a limit, 0…255, from clicks. */
@@ -174,11 +163,8 @@ const jobs = {
     return {};
   },
 
-  /** Find the free space in the world's frame; null where no view tells. */
-  space() {
-    const space = freeSpace(views, geometry.centers);
-    return space && { ...space, low: inWorld(space.low) };
-  },
+  /** Find the free space, in the frame of the packed splats; null where no view tells. */
+  space: () => freeSpace(views, geometry.centers),
 
   /** Find the point of the world at a pixel; null where nothing is. */
   point({ camera, x, y }) {
