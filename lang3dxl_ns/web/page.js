@@ -8,7 +8,7 @@ import { List } from "./list.js";
 import { distanceAsText, drawScale, heightAsText, inShares, setLength } from "./measure.js";
 import { Photos } from "./photos.js";
 import { areExamples, asPython, drawOutline, examplesAsText, examplesFromText, inside, rounded, UNNAMED, wordsFile } from "./teach.js";
-import { thinker } from "./think.js";
+import { fetched, thinker } from "./think.js";
 import { Tour } from "./tour.js";
 import { parsePrompts, tidy } from "./vocabulary.js";
 import { View } from "./view.js";
@@ -312,25 +312,19 @@ async function keepTour() {
   if (answered && !answered.ok) say(`The scene does not keep the tour: ${await answered.text()}`);
 }
 
-/** Teach a named word to the scene behind a live page, which answers it from then on. */
+/** Teach a named word to the scene behind a live page, which answers it from then on; its card says what became of it. */
 async function teachScene(prompt, before = prompt.text) {
-  const marks = about.live && prompt.named ? asPython(prompt.examples, about.cameras) : [];
-  if (!marks.length) {
-    if (prompt.named && !about.live) tellCard(prompt, "This browser keeps it. Save writes a file for lang3dxl words --load, which learns it from the photos.");
-    return;
+  if (!prompt.named) return;
+  const marks = asPython(prompt.examples, about.cameras), answered = about.live && marks.length ? await post("api/teach", { name: prompt.text, before, examples: marks }) : null;
+  if (!about.live) prompt.told = "This browser keeps it. Save writes a file for lang3dxl words --load, which learns it from the photos.";
+  else if (answered && !answered.ok) prompt.told = `The scene did not learn it: ${await answered.text()}`;
+  else if (answered) {
+    taughtHere.add(prompt.text);
+    await think("forget", { texts: [prompt.text, before] });
+    prompt.inScene = true;
+    await answer(prompt);
+    prompt.told = (await answered.json()).told;
   }
-  const answered = await post("api/teach", { name: prompt.text, before, examples: marks });
-  if (!answered.ok) return tellCard(prompt, `The scene did not learn it: ${await answered.text()}`);
-  taughtHere.add(prompt.text);
-  await think("forget", { texts: [prompt.text, before] });
-  prompt.inScene = true;
-  await answer(prompt);
-  prompt.told = (await answered.json()).told;
-  draw();
-}
-
-function tellCard(prompt, told) {
-  prompt.told = told;
   draw();
 }
 
@@ -409,7 +403,7 @@ async function apply(hash, turn = drop(), isStop = false) {
     list.fields = wanted;
     for (const prompt of found) if (prompt.named) keepWord(prompt);
     for (const prompt of found) if (taughtHere.has(prompt.text) && !prompt.inScene) attempt(() => teachScene(prompt));
-    const photo = photos.named(wanted.photo);
+    const photo = photos.list.find(({ name }) => name === wanted.photo);
     if (photo?.photo && isStop) photos.coming = photo;
     else if (photo?.photo) photos.show(photo);
   } finally {
@@ -541,7 +535,7 @@ async function chooseLook(photo) {
 /** Show the scene in a photo's lighting. */
 async function light(photo) {
   $("look").value = photo;
-  const colors = photo ? new Uint8Array(await (await fetched(about.looks[photo])).arrayBuffer()) : view.root.own;
+  const colors = photo ? new Uint8Array(await (await fetched(about.looks[photo], about)).arrayBuffer()) : view.root.own;
   if ($("look").value === photo && view.root.plain !== colors) view.light(colors); // unless a later choice has been read in the meantime
 }
 
@@ -555,12 +549,6 @@ function hideFloaters() {
 
 // ── start ──
 
-async function fetched(name) {
-  const file = await fetch(about?.files?.[name] ?? name); // a written page's data have names by content
-  if (!file.ok) throw new Error(`${name} is missing (${file.status}): write the page again.`);
-  return file;
-}
-
 async function open() {
   about = await (await fetched("scene.json")).json();
   kept = new Kept(about);
@@ -569,7 +557,7 @@ async function open() {
   $("lighting").hidden = !Object.keys(about.looks).length;
   $("look").append(...Object.keys(about.looks).map((name) => element("option", { value: name }, name)));
   for (const control of [...$("ask").elements, $("teach")]) control.disabled = !about.words;
-  const splats = await (await fetched("splats.bin")).arrayBuffer();
+  const splats = await (await fetched("splats.bin", about)).arrayBuffer();
   await unpacked;
   view = new View(about, $("frame"));
   list = new List(about, think, view, prompts);
@@ -596,7 +584,7 @@ async function readMeaning(splats) {
 
 /** Read which Gaussians float, once the page answers. */
 async function readFloaters() {
-  view.root.floats = new Uint8Array(await (await fetched(about.floaters)).arrayBuffer());
+  view.root.floats = new Uint8Array(await (await fetched(about.floaters, about)).arrayBuffer());
   $("floating").hidden = false;
   hideFloaters();
 }
@@ -606,7 +594,7 @@ async function begin() {
   const turn = cleared;
   if (about.words) setTimeout(() => think("space").then((space) => (view.mover.space = space))); // behind the prompts
   setTimeout(() => attempt(readFloaters));
-  if (about.detail) new Detail(about, view, think, { read: fetched, question, failed: (error) => say(error.message) });
+  if (about.detail) new Detail(about, view, think, { read: (name) => fetched(name, about), question, failed: (error) => say(error.message) });
   const { stops, play } = readFields(location.hash);
   if (location.hash.length > 1) await apply(location.hash, turn);
   else for (const [text, ...negatives] of about.prompts) if (turn === cleared) await ask(asTyped({ text, negatives }), turn);

@@ -46,10 +46,6 @@ export class Photos {
     say(photo.doubtful ? `${photo.name}: its place is doubtful: ${photo.doubtful}.` : `Photo ${this.at + 1} of ${this.list.length}: ${photo.name}.`);
   }
 
-  named(name) {
-    return this.list.find((photo) => photo.name === name);
-  }
-
   /** Show the photo that was flown to once it is reached, and hide it when the eye leaves. */
   follow() {
     const { mover } = this.view;

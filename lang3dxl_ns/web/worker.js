@@ -5,6 +5,7 @@ import { massOf, rankViews, readViews } from "./find.js";
 import { likeness } from "./like.js";
 import { bestPhoto, gaussiansAt, middleOf, unpackSplats } from "./pick.js";
 import { freeSpace } from "./space.js";
+import { fetched } from "./think.js";
 import { isPresent, Known, thingsOf } from "./things.js";
 import { ancestry, FAN } from "./tree.js";
 import { Vocabulary } from "./vocabulary.js";
@@ -25,12 +26,6 @@ async function understood(phrases) {
 function judged([text, ...negatives], threshold) {
   const relevancy = answers.relevancy(text, negatives.map(({ own }) => own));
   return answers.verdict(relevancy, { strict: Boolean(negatives.length || text.taught), doubt: text.taught?.doubt, threshold, name: text.name });
-}
-
-async function file(name) {
-  const answer = await fetch(about.files?.[name] ?? name);
-  if (!answer.ok) throw new Error(`${name} is missing (${answer.status})`);
-  return answer;
 }
 
 /** Read rows of codes, or rows that were decoded beforehand. */
@@ -70,13 +65,13 @@ const hitsAt = (camera, x, y) => gaussiansAt([...parts.values()].map(({ geometry
 
 /** Move a point into the world's frame. */
 const inWorld = (point) => point.map((value, axis) => value + about.center[axis]);
-const bytes = async (name) => (await file(name)).arrayBuffer();
+const bytes = async (name) => (await fetched(name, about)).arrayBuffer();
 
 const jobs = {
   async load({ description, splats }) {
     about = description;
     const { words } = about;
-    const [listed, numbers] = [await (await file("vocabulary.json")).json(), await bytes("vocabulary.bin")];
+    const [listed, numbers] = [await (await fetched("vocabulary.json", about)).json(), await bytes("vocabulary.bin")];
     vocabulary = new Vocabulary(listed, numbers, words.width, about.live);
     const tell = (done) => new Promise((go) => (postMessage({ done }), setTimeout(go)));
     field = words.field && (await bytes("field.bin"));
