@@ -79,9 +79,8 @@ class PageWords:
             return scene
         left = [example for example in word.examples if _plain(example) not in ours]
         rest = [other for other in scene.words.values() if other is not word]
-        if left:
-            return scene.with_words(rest).teach(word.name, left)
-        return scene.with_words(rest)
+        scene = scene.with_words(rest)
+        return scene.teach(word.name, left) if left else scene
 
 
 def _plain(example: Example) -> dict[str, Any]:
