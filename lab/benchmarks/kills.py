@@ -71,6 +71,7 @@ class Kills:
         shutil.rmtree(self.out, ignore_errors=True)
         self.out.mkdir(parents=True)
         out, draw = self.out.absolute(), random.Random(self.seed)
+        signal.signal(signal.SIGINT, signal.default_int_handler)  # shells start background jobs without it
         processes.start_server()
         stock(out)
         cases = {name: case for name, case in CASES.items() if not self.only or name in self.only}
