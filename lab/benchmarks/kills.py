@@ -34,7 +34,7 @@ from lang3dxl_ns.scene.colmap import read_reconstruction
 SIGNALS = (signal.SIGKILL, signal.SIGINT, signal.SIGTERM)
 TAUGHT, CLIP = "gizmo", ("--clip", "../clip", "--dense", "none")
 TEACH = ("--photo", "photo_000.jpg", "--box", "20,20,60,50")
-WHOLE = r"sparse already exists and is left alone|already has \d+\s+iterations"
+WHOLE = r"sparse already exists and is left alone|already has \d+\s+iterations|no photos that the model lacks"
 """What commands say, as errors, if a kill came after all of their work."""
 Told = list[str]
 
