@@ -33,7 +33,6 @@ BENCHMARKS = {
     "ablation": ("lab.benchmarks.ablation:Ablation", "The method, baselines, and ablations."),
     "training": ("lab.benchmarks.training:TrainingBenchmark", "A training step by its parts."),
     "gpu": ("lab.benchmarks.gpu:GpuBenchmark", "A GPU: parity, numerics, time, memory, in one file to send."),
-    "scale": ("lab.benchmarks.scale:ScaleBenchmark", "Growing numbers of photos and of Gaussians."),
     "holyscenes": ("lab.benchmarks.published:HolyScenes", "HolyScenes, beside the published figures."),
     "lerf-ovs": ("lab.benchmarks.published:LerfOvs", "LERF-OVS, beside the published figures."),
     "pt-ovs": ("lab.benchmarks.published:PtOvs", "PT-OVS, scene by scene."),

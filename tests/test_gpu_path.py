@@ -21,7 +21,7 @@ from lang3dxl_ns.components.compression import CompressedField
 from lang3dxl_ns.open_scene import load_scene
 from lang3dxl_ns.query.ask import prompts_of
 from lang3dxl_ns.scene.capture import open_capture
-from lang3dxl_ns.training import estimate, fit, gaussians
+from lang3dxl_ns.training import fit, gaussians
 from lang3dxl_ns.training.step import decoded_side, losses
 
 pytestmark = pytest.mark.nerfstudio
@@ -212,7 +212,6 @@ def test_a_cap_holds_and_the_least_opaque_go(trained):
 
 def test_out_of_memory_ends_in_three_settings_that_help(trained, monkeypatch):
     """The checkpoint of before stays the latest."""
-    from lang3dxl_ns.common.errors import UserError
     from lang3dxl_ns.plugin.trainer import Lang3DXLTrainer
 
     step, saved = Lang3DXLTrainer.train_iteration, []
@@ -238,23 +237,6 @@ def test_a_resumed_run_goes_on(trained):
     assert again._start_step == 4
     before, after = (t.pipeline.model.gauss_params["features_dc"].detach().cpu() for t in (first, again))
     assert not torch.equal(before, after[: len(before)])
-
-
-def test_hours_without_gsplat_are_not_begun(monkeypatch):
-    """A short run is; a long one says how long it would take, unless torch was chosen."""
-    monkeypatch.setattr(estimate, "torch_rendering_seconds", lambda: 0.1)
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    monkeypatch.setattr(estimate, "warn_of_unused_gpu", lambda: None)
-    monkeypatch.setattr(estimate.gsplat_build, "ready", lambda: False)
-    with pytest.raises(UserError, match=r"30,000 iterations.*about 2.5 hours.*rasterizer torch"):
-        estimate.check_device("cuda", "auto", 30_000)
-    estimate.check_device("cuda", "torch", 30_000)
-    estimate.check_device("cuda", "auto", 1_000)
-
-
-def test_a_rendering_by_torch_takes_time(gpu):
-    with gpu():
-        assert estimate.torch_rendering_seconds(50, (40, 30)) > 0
 
 
 def test_the_torch_rasterizer_renders_on_the_gpu_without_gsplat(trained, monkeypatch):

@@ -60,9 +60,6 @@ class Prepare(PreparationConfig):
     """Folder of photos, with images/ and sparse/0/ or without a model, or a video."""
     cache_dir: Path | None = None
     """Folder for the targets (default: lang3dxl_cache inside the data folder)."""
-    clean: bool = False
-    """Delete targets that these settings and the scene's photos do not use (such as those of removed photos,
-    or dense features with --dense none), and make none."""
 
     def main(self) -> None:
         from lang3dxl_ns.preparation.model_files import check_encoders
@@ -70,13 +67,9 @@ class Prepare(PreparationConfig):
         from lang3dxl_ns.scene.photo_folder import check_data
 
         check_data(self.data)
-        if not self.clean:
-            check_encoders(self.clip, self.dense)
+        check_encoders(self.clip, self.dense)
         prepared = _opened(self, self.data, self.cache_dir)
-        if self.clean:
-            files, freed = prepared.clean_store()
-            print(f"Deleted {files} files, {freed / 1e6:.1f} MB, from {prepared.cache_dir}")
-        elif prepared.targets is not None:
+        if prepared.targets is not None:
             print(f"Targets of {len(prepared.targets.names)} photos are in {prepared.cache_dir}")
         for kind, (files, size) in FeatureStore(prepared.cache_dir).sizes().items():
             print(f"  {kind}: {files} files, {size / 1e6:.1f} MB")

@@ -12,7 +12,6 @@ import torch
 import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor, nn
-from torch.autograd.function import once_differentiable
 
 from lang3dxl_ns.common.kernels import takes_kernels
 
@@ -101,10 +100,14 @@ class HashGrid(nn.Module):
             return self._interpolated_by_kernels(x)
         # Whole units are separate integers: far from 0, a float32 product has no digits left for a fraction.
         whole = x.detach().floor()
-        position = (x.detach() - whole).T[:, None] * self.cells[:, None] + 0.5
-        lower = position.floor()
-        index = self._vertex_entries(lower.long() + whole.long().T[:, None] * self.cells[:, None])
-        return _Interpolate.apply(x, self.table, index, position - lower, self.cells)
+        position = (x - whole).T[:, None] * self.cells[:, None] + 0.5
+        lower = position.detach().floor()
+        rows = self._vertex_entries(lower.long() + whole.long().T[:, None] * self.cells[:, None])
+        weights = _corner_weights(position - lower)
+        # Points vary fastest in what was computed so far, which suits elementwise work; corners do in bags.
+        bags = [part.permute(2, 1, 0).reshape(-1, len(rows)) for part in (rows, weights.to(self.table.dtype))]
+        features = F.embedding_bag(bags[0], self.table, per_sample_weights=bags[1], mode="sum")
+        return features.view(len(x), self.output_dim)
 
     def _interpolated_by_kernels(self, x: Float[Tensor, "n d"]) -> Float[Tensor, "n out"]:
         from lang3dxl_ns.components.fused_hash_grid import Lattices, interpolate  # numba is slow to import
@@ -131,55 +134,9 @@ class HashGrid(nn.Module):
         return (torch.cat((dense_entry, hashed_entry), 1) + self.offsets[:, None]).int()
 
 
-class _Interpolate(torch.autograd.Function):
-    """Multilinear interpolation of table rows, all levels at once.
-
-    It is written by hand because autograd through `embedding_bag` takes two to three times as long on a CPU.
-    Here the derivative along an axis is the same interpolation with that axis' weights (1 - t, t) replaced by
-    (-s, s), where s is the number of cells per unit.
-    """
-
-    @staticmethod
-    def forward(ctx, x, table, index, fraction, cells):
-        # Points vary fastest in `index` and `fraction`, which suits elementwise work; corners do in bags.
-        rows = _as_bags(index)
-        axis_weights = torch.stack((1 - fraction, fraction), 1)
-        weights = _as_bags(_corner_weights(list(axis_weights))).to(table.dtype)
-        ctx.save_for_backward(table, rows, weights, axis_weights, cells)
-        features = F.embedding_bag(rows, table, per_sample_weights=weights, mode="sum")
-        return features.view(len(x), len(cells) * table.shape[1])
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx, grad):
-        table, rows, weights, axis_weights, cells = ctx.saved_tensors
-        grad_bags = grad.reshape(-1, table.shape[1])
-        grad_x = grad_table = None
-        if ctx.needs_input_grad[1]:
-            grad_table = grad.new_zeros(len(table), grad_bags.shape[1])
-            for corner_rows, corner_weights in zip(rows.T, weights.T, strict=True):
-                grad_table.index_add_(0, corner_rows, grad_bags * corner_weights[:, None])
-        if ctx.needs_input_grad[0]:
-            slope = cells.to(axis_weights)[:, None].expand_as(axis_weights[0, 0])
-            derivatives = []
-            for axis in range(len(axis_weights)):
-                factors = list(axis_weights)
-                factors[axis] = torch.stack((-slope, slope))
-                slopes = _as_bags(_corner_weights(factors)).to(table.dtype)
-                derivative = F.embedding_bag(rows, table, per_sample_weights=slopes, mode="sum")
-                derivatives.append((derivative * grad_bags).view(grad.shape).sum(1, dtype=slope.dtype))
-            grad_x = torch.stack(derivatives, 1)
-        return grad_x, grad_table, None, None, None
-
-
-def _corner_weights(factors: list[Float[Tensor, "2 levels n"]]) -> Float[Tensor, "corners levels n"]:
+def _corner_weights(fraction: Float[Tensor, "d levels n"]) -> Float[Tensor, "corners levels n"]:
     """Multiply the axes' weights for all corners of a cell, in the order of `_vertex_entries`."""
-    weights = factors[0]
-    for factor in factors[1:]:
-        weights = (weights[:, None] * factor).flatten(0, 1)
-    return weights
-
-
-def _as_bags(per_corner: Tensor) -> Tensor:
-    """Reorder [corners, levels, n] to contiguous [n · levels, corners]."""
-    return per_corner.permute(2, 1, 0).reshape(-1, per_corner.shape[0])
+    first, *others = torch.stack((1 - fraction, fraction), 1)
+    for sides in others:
+        first = (first[:, None] * sides).flatten(0, 1)
+    return first

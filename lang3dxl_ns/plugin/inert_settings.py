@@ -46,12 +46,6 @@ def check_inert(
 ) -> None:
     """Raise UserError if a setting that has no effect in this run differs from its default. model, data:
     settings of the model and of the data manager. optimizers: those of the parameter groups."""
-    changed = [
-        *_changed(model, OF_SPLATFACTO, "--pipeline.model."),
-        *_changed(data, OF_IMAGE_CACHES, "--pipeline.datamanager."),
-    ]
-    if changed:
-        raise UserError(f"{changed[0]} has no effect here: no method of this package reads it; leave it off")
     if model.decoder.learns_from_renderings:
         return
     changed = _changed(model, _OF_RENDERINGS, "--pipeline.model.")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 import re
 import sys
@@ -11,10 +10,10 @@ from dataclasses import MISSING, fields, is_dataclass
 from enum import Enum
 from functools import cache
 from pathlib import Path, PurePath, PurePosixPath, PureWindowsPath
-from types import UnionType
-from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+from typing import Any, get_type_hints
 
 import yaml
+from typeguard import TypeCheckError, check_type
 
 from lang3dxl_ns.common.errors import UserError, in_a_line
 from lang3dxl_ns.common.files import read_text
@@ -116,22 +115,12 @@ def _hints(settings: type) -> dict[str, Any]:
 
 
 def _fits(value: Any, hint: Any) -> bool:
-    """Return whether a value is of a setting's type, if that is a plain one."""
-    kind, parts = get_origin(hint), get_args(hint)
-    if kind is Literal:
-        return value in parts
-    if kind in (Union, UnionType):
-        return any(_fits(value, part) for part in parts)
-    if kind is Annotated:
-        return _fits(value, parts[0])
-    if kind is tuple and isinstance(value, tuple) and ... not in parts:
-        return len(value) == len(parts) and all(map(_fits, value, parts))
-    if hint is float:
-        return type(value) in (int, float) and not math.isnan(value)
-    if hint is int:
-        return type(value) is int
-    kind = kind or hint
-    return isinstance(value, kind) if isinstance(kind, type) and kind is not type else True
+    """Return whether a value is of a setting's type, and not NaN."""
+    try:
+        check_type(value, hint)
+    except TypeCheckError:
+        return False
+    return bool(value == value)
 
 
 def check_command_line(arguments: Sequence[str]) -> None:

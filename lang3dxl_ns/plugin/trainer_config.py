@@ -95,7 +95,7 @@ class Lang3DXLTrainerConfig(RunConfig):
             raise UserError(f"{own} is of an earlier run: resume it with --load-dir, or change --timestamp")
         data = self.pipeline.datamanager
         check_encoders(data.clip, data.dense)
-        check_device(self.machine.device_type, self.pipeline.model.rasterizer, self.max_num_iterations)
+        check_device(self.machine.device_type, self.pipeline.model.rasterizer)
         if fresh:
             self._claim_folder()
 

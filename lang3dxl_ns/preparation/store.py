@@ -9,7 +9,7 @@ import json
 import logging
 import re
 import time
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lang3dxl_ns.common.console import say, tracked
+from lang3dxl_ns.common.console import tracked
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import read_json, replace_file
 from lang3dxl_ns.common.options import data_option
@@ -27,7 +27,7 @@ logger = logging.getLogger(__name__)
 
 _HALF_MAX = torch.finfo(torch.float16).max
 _ENTRY = re.compile(r".+\.[0-9a-f]{16}\.(safetensors|png|jpg)")
-"""Names of targets, masks, and photos at working size. Nothing else is ever deleted."""
+"""Names of targets, masks, and photos at working size."""
 _HASHES = "photo_hashes.json"
 _LEFTOVER_AGE_S = 3600.0
 """Age in seconds from which a temporary file is a leftover of a killed process; a write takes seconds."""
@@ -174,25 +174,6 @@ class FeatureStore:
     def _kinds(self) -> list[Path]:
         """List the folders of entries. Links may lead into another scene's targets, and are left out."""
         return sorted(path for path in self.root.glob("*") if path.is_dir() and not path.is_symlink())
-
-    def clean(self, kinds: Collection[str], names: Collection[str], shared: bool = False) -> tuple[int, int]:
-        """Delete all entries except those of these kinds and photos, and return their number and bytes. Of a
-        `shared` folder, entries of other photos stay, since they may be another scene's, and are told of."""
-        self.remove_leftovers()
-        keep = {self.path(kind, name).with_suffix("") for name in names for kind in kinds}
-        own = {self.path("", name).stem for name in names}
-        files, freed, left = 0, 0, 0
-        for path in (path for folder in self._kinds() for path in folder.iterdir()):
-            if not _ENTRY.fullmatch(path.name) or path.with_suffix("") in keep:
-                continue
-            if shared and path.stem not in own:
-                left += 1
-            else:
-                files, freed = files + 1, freed + path.stat().st_size
-                path.unlink()
-        if left:
-            say(f"{left} entries of other photos stay, since another scene may use {self.root}")
-        return files, freed
 
     def remove_leftovers(self) -> None:
         """Delete temporary files of processes that were killed while writing."""

@@ -18,7 +18,7 @@ from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.memory import machine_memory
 from lang3dxl_ns.common.options import data_option
 from lang3dxl_ns.preparation.encoders import usual_dense
-from lang3dxl_ns.preparation.foreground import foreground_kind, with_foreground
+from lang3dxl_ns.preparation.foreground import with_foreground
 from lang3dxl_ns.preparation.model_files import CLIP_OPTION, find_model, usual_clip
 from lang3dxl_ns.preparation.needs import Need, scene_needs
 from lang3dxl_ns.preparation.photo_cache import PhotoCache, has_vanished
@@ -27,8 +27,8 @@ from lang3dxl_ns.preparation.prepare import prepare
 from lang3dxl_ns.preparation.regions import RegionSource, region_source
 from lang3dxl_ns.preparation.settings import PreparationConfig
 from lang3dxl_ns.preparation.store import FeatureStore, PhotosGoneError
-from lang3dxl_ns.preparation.targets import CLIP, DENSE, FINE, REGIONS, Batch, SceneFacts, TargetReader
-from lang3dxl_ns.preparation.working_photos import PHOTO_MASKS, PHOTOS, WorkingPhotos
+from lang3dxl_ns.preparation.targets import Batch, SceneFacts, TargetReader
+from lang3dxl_ns.preparation.working_photos import WorkingPhotos
 from lang3dxl_ns.scene.capture import Capture
 from lang3dxl_ns.scene.photo import Photo
 from lang3dxl_ns.scene.reconstruction import doubtful_photos
@@ -177,17 +177,6 @@ class TrainingData:
             list(self.photos.values()), self.crops.pixel_sizes, self.config, self.crops.scales,
             FeatureStore(self.cache_dir), self.device, self._regions, fine,
         )  # fmt: skip
-
-    def clean_store(self) -> tuple[int, int]:
-        """Delete targets that these settings and the photos don't use; count files and bytes. A cache outside
-        the photos' folder may be shared, so there only these photos' files go."""
-        config, used = self.config, [PHOTOS, PHOTO_MASKS]
-        used += [CLIP, FINE] if config.clip != "none" else []
-        used += [DENSE] if config.dense != "none" else []
-        used += [foreground_kind(config)] if config.foreground == "text" else []
-        used += [REGIONS] if self._regions is not None else []
-        shared = self.cache_dir.parent != self.capture.folder
-        return FeatureStore(self.cache_dir).clean(used, list(self.views), shared)
 
     def facts(self) -> SceneFacts:
         """Return what a model is built from. Raises UserError if no training photo has targets."""

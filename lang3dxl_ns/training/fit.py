@@ -253,7 +253,7 @@ def begin(capture: Capture, settings: Settings, out: Path, cache_dir: Path, devi
     warnings.filterwarnings("ignore", "Detected call of .lr_scheduler.step")
     settings.resolve()
     device = device or best_device()
-    check_device(device, settings.scene.rasterizer, settings.steps)
+    check_device(device, settings.scene.rasterizer)
     if settings.mixed_precision and not (device.startswith("cuda") and torch.cuda.is_bf16_supported(False)):
         raise UserError("--mixed-precision needs a GPU that multiplies bfloat16 (since Ampere): leave it off")
     out.mkdir(parents=True, exist_ok=True)

@@ -1,6 +1,7 @@
 // Pieces of the panel: messages, and a card per prompt with its color, heat, threshold and trust.
 import { advice } from "./vocabulary.js";
 
+export const $ = (id) => document.getElementById(id);
 export const percent = (share) => (share > 0 && share < 0.01 ? "under 1 %" : `${Math.round(100 * share)} %`);
 export const shown = (text, most = 60) => (text.length > most ? `${text.slice(0, most - 1)}…` : text);
 
@@ -11,13 +12,17 @@ export function element(tag, properties = {}, ...children) {
   return made;
 }
 
-export function say(message) {
-  document.getElementById("status").textContent = message;
-}
+/** Create a small button. */
+export const small = (label, onclick, more = {}) => element("button", { className: "small", onclick, ...more }, label);
+export const say = (message) => ($("status").textContent = message);
 
-export const explain = ({ count, detail, known, live, foreground }) =>
-  `${(detail?.count ?? count).toLocaleString("en")} Gaussians. ` + (live ? "Ask for anything." : `Ask for any of ${known.toLocaleString("en")} words.`) +
-  (foreground.length ? ` Matches lie on ${foreground.map(([text]) => shown(text)).join(" or ")}.` : "");
+/** Say what can be asked. known: the words that the page answers, once it has read what the scene means. */
+export function explain({ count, detail, known, live, words, foreground }) {
+  if (!words) return "This scene has colors alone: it can't be asked.";
+  if (!known) return "Reading what the scene means…";
+  const within = foreground.length ? ` Matches lie on ${foreground.map(([text]) => shown(text)).join(" or ")}.` : "";
+  return `${(detail?.count ?? count).toLocaleString("en")} Gaussians. ${live ? "Ask for anything." : `Ask for any of ${known.length.toLocaleString("en")} words.`}${within}`;
+}
 
 /** Return how many Gaussians of the scene so many of chunk 0 stand for. about: the page's description. */
 export const wholeCount = (number, { count, detail }) => (detail ? Math.round((number * detail.count) / count) : number);
@@ -35,36 +40,47 @@ function doubtIn({ text, examples, open, taught, trust }) {
 
 const sentence = (text) => `${text[0].toUpperCase()}${text.slice(1)}.`;
 
-/** Build a prompt's card. acts: { fly, remove, rename, dragThreshold, setThreshold, teach, outline, save, forget },
- * each called with the prompt; about: the page's description. */
+/** Put these behind an element, instead of what is there; the element itself stays, and so does what one types in it. */
+function follow(first, ...others) {
+  while (first.nextSibling) first.nextSibling.remove();
+  first.after(...others);
+}
+
+/** Make a prompt's card, with its name: a field for what is taught by example. */
+function cardOf(prompt, rename) {
+  const { text, negatives, examples } = prompt, name = [text, ...negatives].map((one) => shown(one));
+  const heading = examples ? element("input", { ariaLabel: "Name", maxLength: 60 }) : element("strong", {}, name[0] + (negatives.length ? ` not ${name.slice(1).join(", ")}` : ""));
+  if (examples) heading.addEventListener("change", () => rename(prompt, heading.value));
+  return element("li", {}, element("header", {}, heading));
+}
+
+/** Bring a prompt's card up to date, and return it. acts: { fly, remove, rename, dragThreshold, setThreshold, teach,
+ * outline, save, forget }, each called with the prompt; about: the page's description. */
 export function promptCard(prompt, { fly, remove, rename, dragThreshold, setThreshold, teach, outline, save, forget }, about) {
-  const { text, negatives, color, threshold, peak, matching, views, examples, open } = prompt;
-  const card = element("li");
+  const { text, color, threshold, peak, matching, views, examples, open } = prompt, card = (prompt.card ??= cardOf(prompt, rename));
+  const [header] = card.children, [heading] = header.children, parts = [];
   card.style.setProperty("--color", `rgb(${color})`);
-  const name = shown(text) + (negatives.length ? ` not ${negatives.map((one) => shown(one)).join(", ")}` : "");
-  const go = element("button", { className: "small fly", disabled: !views?.some((one) => one.shown), onclick: () => fly(prompt) }, "Fly to");
-  const away = element("button", { className: "small", ariaLabel: `Remove ${shown(text)}`, onclick: () => remove(prompt) }, "×");
-  const heading = examples ? element("input", { defaultValue: text, ariaLabel: "Name", maxLength: 60 }) : element("strong", {}, name);
-  const named = () => heading.kept || heading.value === heading.defaultValue || rename(prompt, (heading.defaultValue = heading.value));
-  if (examples) for (const event of ["change", "blur"]) heading.addEventListener(event, named);
-  heading.addEventListener("keydown", ({ key }) => key === "Enter" && named());
-  const button = (label, act, pressed) => element("button", { className: "small", ariaPressed: pressed, onclick: () => act(prompt) }, label);
-  card.append(element("header", {}, heading, ...(examples ? [button(open ? "Done" : "Add", teach, open)] : []), go, away));
+  if (examples && heading.defaultValue !== text) heading.value = heading.defaultValue = text;
+  const button = (label, act, pressed) => small(label, () => act(prompt), { ariaPressed: pressed });
+  const go = small("Fly to", () => fly(prompt), { className: "small fly", disabled: !views?.some((one) => one.shown) });
+  follow(heading, ...(examples ? [button(open ? "Done" : "Add", teach, open)] : []), go, small("×", () => remove(prompt), { ariaLabel: `Remove ${shown(text)}` }));
   if (open) {
     const without = button("Not this", () => (without.ariaPressed = prompt.without = !prompt.without), Boolean(prompt.without));
     without.disabled = !examples.length;
-    card.append(
+    parts.push(
       element("div", { className: "teach" }, without, button("Outline", outline), ...(prompt.named ? [button("Save", save), button("Forget", forget)] : [])),
       element("p", { className: "hint" }, examples.length ? prompt.told ?? "" : "Click on it in the view, or outline it. Then give it a name.")); // prettier-ignore
   }
-  if (threshold == null) return card;
-  const slider = element("input", { type: "range", min: 0, max: 1, step: 0.01, value: threshold, ariaLabel: `Threshold of ${shown(text)}` });
-  slider.addEventListener("input", () => dragThreshold(prompt, Number(slider.value)));
-  slider.addEventListener("change", () => setThreshold(prompt, Number(slider.value)));
-  const ends = [threshold, peak].map((value) => element("span", {}, value.toFixed(2)));
-  if (peak > threshold) card.append(element("div", { className: "ends" }, ends[0], element("div", { className: "heat" }), ends[1]));
-  card.append(
-    element("p", {}, `${doubtIn(prompt)} `, element("span", { className: "count" }, matched(matching, about))),
-    element("label", {}, "Threshold", slider)); // prettier-ignore
+  if (threshold != null) {
+    const slider = element("input", { type: "range", min: 0, max: 1, step: 0.01, value: threshold, ariaLabel: `Threshold of ${shown(text)}` });
+    slider.addEventListener("input", () => dragThreshold(prompt, Number(slider.value)));
+    slider.addEventListener("change", () => setThreshold(prompt, Number(slider.value)));
+    const ends = [threshold, peak].map((value) => element("span", {}, value.toFixed(2)));
+    if (peak > threshold) parts.push(element("div", { className: "ends" }, ends[0], element("div", { className: "heat" }), ends[1]));
+    parts.push(
+      element("p", {}, `${doubtIn(prompt)} `, element("span", { className: "count" }, matched(matching, about))),
+      element("label", {}, "Threshold", slider)); // prettier-ignore
+  }
+  follow(header, ...parts);
   return card;
 }

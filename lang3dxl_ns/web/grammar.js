@@ -1,4 +1,5 @@
 // Questions about things: counts, superlatives, ordinals and relations, as in Python's things/grammar.py.
+import { dot } from "./answer.js";
 import language from "./language.js";
 
 const { grammar } = language, { BESIDE, INSIDE, CLOSE, VIEWS } = language.things;
@@ -111,7 +112,6 @@ export function unsure(request, found, view, shown = (word) => word) {
   return close ? `another ${shown(request.word)} measures nearly the same` : null;
 }
 
-const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 const minus = (a, b) => a.map((value, axis) => value - b[axis]);
 
 function measure({ center, size }, kind, view) {

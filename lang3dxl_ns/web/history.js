@@ -94,23 +94,23 @@ function without(hash) {
   return String(fields);
 }
 
-/** A list kept in this browser for the scene: earlier "prompts" or named "words", latest first. */
+/** Words that this browser keeps for the scene, latest first. */
 export class Kept {
   constructor({ title, count, center }) {
-    this.scene = `${title} ${count} ${center}`;
+    this.name = `lang3dxl words ${title} ${count} ${center}`;
   }
 
-  list(kind) {
+  get words() {
     try {
-      return [JSON.parse(localStorage.getItem(`lang3dxl ${kind} ${this.scene}`))].flat().filter(Boolean);
+      return [JSON.parse(localStorage.getItem(this.name))].flat().filter(Boolean);
     } catch {
       return []; // the browser keeps nothing
     }
   }
 
-  store(kind, list) {
+  set words(list) {
     try {
-      localStorage.setItem(`lang3dxl ${kind} ${this.scene}`, JSON.stringify(list.slice(0, MOST_KEPT)));
+      localStorage.setItem(this.name, JSON.stringify(list.slice(0, MOST_KEPT)));
     } catch {} // the browser keeps nothing
   }
 }

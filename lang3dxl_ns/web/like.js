@@ -14,16 +14,13 @@ export function likeness(rows, examples, judged = rows) {
 
 const probability = ({ direction, start }, rows) => rows.times(direction).map((x, i) => (rows.scales[i] ? 1 / (1 + Math.exp(-x - start)) : 0));
 
-const fits = new Map(); // of the examples that were asked latest
-const MOST_FITS = 12;
+const fits = new Map();
 
+/** Fit examples, once for each list of them. */
 function remembered(rows, examples) {
   const key = JSON.stringify(examples.map(({ rows, without }) => [rows, without]));
-  const fit = fits.get(key) ?? likely(rows, examples);
-  fits.delete(key);
-  fits.set(key, fit);
-  if (fits.size > MOST_FITS) fits.delete(fits.keys().next().value);
-  return fit;
+  if (!fits.has(key)) fits.set(key, likely(rows, examples));
+  return fits.get(key);
 }
 
 /** Fit a weighted logistic regression on the decoder's rows, standardized over the scene. Together the examples weigh

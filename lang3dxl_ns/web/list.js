@@ -1,5 +1,5 @@
 // The list of a word's things: how many were found, one after the other, their boxes, and questions about them.
-import { element, shown } from "./cards.js";
+import { element, shown, small } from "./cards.js";
 import { answerTo, count, parse, unsure, wordsOf } from "./grammar.js";
 import { Vector3 } from "./library.js";
 import { lengthAsText } from "./measure.js";
@@ -38,7 +38,7 @@ export class List extends EventTarget {
   /** Build the part of a prompt's card that lists its things; null before they are found. */
   part(prompt) {
     if (!prompt.found) return null;
-    const { things } = prompt.found, small = (label, act, more) => element("button", { className: "small", onclick: act, ...more }, label);
+    const { things } = prompt.found;
     const summary = element("summary", {}, things.length ? count(prompt.found, this.about.detail ? " found in the coarse scene" : " found") : "No single things found");
     const made = element("details", { className: "things", open: Boolean(prompt.listed) }, summary);
     summary.addEventListener("click", (event) => {

@@ -1,9 +1,9 @@
 // Lengths in meters, where the photos' GPS or a length that one types tells them; the scale bar and north.
+import { dot } from "./answer.js";
+import { $ } from "./cards.js";
 
 const WIDEST = 120, ROUND = [5, 2, 1]; // pixels of the scale bar; first digits of its length
-const $ = (id) => document.getElementById(id);
 const length = (vector) => Math.hypot(...vector);
-const dot = (a, b) => a.reduce((sum, value, axis) => sum + value * b[axis], 0);
 const between = ([a, b]) => b.map((value, axis) => value - a[axis]);
 
 /** Return the length of the scene's unit in meters, as { meters, uncertainty }; null where nothing tells it.

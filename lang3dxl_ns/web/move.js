@@ -1,7 +1,7 @@
 // The eye: orbiting and walking by mouse, touch and keys, flights, and the space where it may be.
 import { OrbitControls, PerspectiveCamera, Vector3 } from "./library.js";
 
-const FLIGHT = 1200, WIDEST = 110, BAR = 56; // milliseconds, degrees of a lens, pixels that buttons cover
+const FLIGHT = 1200, WIDEST = 110, ROOM = 8; // milliseconds, degrees of a lens, pixels between a landmark and buttons
 const TURN = 0.1, TAP = 0.1, PACE = 0.25; // radians and seconds of a key press; share of the overview's depth walked in a second
 const LOOK = 0.003, WHEEL = 0.001, STEEPEST = 1.5; // radians per pixel, seconds per unit of the wheel, radians
 const WAYS = { w: [0, 0, 1], s: [0, 0, -1], a: [-1, 0, 0], d: [1, 0, 0], q: [0, -1, 0], e: [0, 1, 0] }; // right, up, ahead
@@ -84,17 +84,24 @@ export class Mover extends EventTarget {
     return { position, target: position.clone().addScaledVector(ahead, distance), fov: Math.min(fov, Math.max(WIDEST, (360 / Math.PI) * Math.atan(high))) };
   }
 
-  /** Compute the viewpoint that shows the whole landmark in this window, below the buttons: from the overview's photo, with
-   * a wider lens. Farther back the eye would stand among what no photo shows from behind. */
+  /** Compute the viewpoint that shows the whole landmark in what buttons and photos leave free of this window: from the
+   * overview's photo, with a wider lens. Farther back the eye would stand among what no photo shows from behind. */
   overviewStand() {
     const start = this.standing(this.about.start), [left, top, right, bottom, depth] = this.about.extent ?? [0, 0, 0, 0, 0];
     if (!depth) return start;
     const rows = this.about.start.pose.slice(0, 3), axis = (k) => new Vector3(...rows.map((row) => row[k]));
-    const turn = ([low, high]) => Math.tan((Math.atan(low) + Math.atan(high)) / 2), half = ([low, high]) => Math.tan((Math.atan(high) - Math.atan(low)) / 2);
-    const ahead = axis(2).negate().addScaledVector(axis(0), turn([left, right])).addScaledVector(axis(1), -turn([top, bottom])).normalize();
-    const { clientHeight } = this.frame, clear = Math.max(1 - (2 * BAR) / clientHeight, 0.5);
-    const fov = (360 / Math.PI) * Math.atan(Math.max(half([top, bottom]) / clear, half([left, right]) / this.aspect));
-    return { position: start.position, target: start.position.clone().addScaledVector(ahead, depth), fov: Math.min(fov, WIDEST) };
+    const middle = (low, high) => (Math.atan(low) + Math.atan(high)) / 2, half = (low, high) => Math.tan((Math.atan(high) - Math.atan(low)) / 2);
+    const { clientHeight: height } = this.frame, [above, below] = this.covered.map((side) => side + ROOM), clear = Math.max(height - above - below, height / 2);
+    const slope = Math.min(Math.max((half(top, bottom) * height) / clear, half(left, right) / this.aspect), Math.tan((WIDEST * Math.PI) / 360));
+    const lift = Math.atan((slope * (above - below)) / height); // how far above the axis the middle of what is free lies
+    const ahead = axis(2).negate().addScaledVector(axis(0), Math.tan(middle(left, right))).addScaledVector(axis(1), -Math.tan(middle(top, bottom) - lift)).normalize();
+    return { position: start.position, target: start.position.clone().addScaledVector(ahead, depth), fov: (360 / Math.PI) * Math.atan(slope) };
+  }
+
+  /** Pixels that buttons cover at the top of the frame, and photos at its bottom. */
+  get covered() {
+    const [tools, strip] = ["tools", "strip"].map((id) => document.getElementById(id));
+    return [tools.offsetTop + tools.offsetHeight, strip.offsetHeight];
   }
 
   // ── flights ──

@@ -1,5 +1,5 @@
 // The page: the search box and its prompts, answers to clicks, words that are taught, and the keys.
-import { element, explain, matched, percent, promptCard, say, shown, wholeCount } from "./cards.js";
+import { $, element, explain, matched, percent, promptCard, say, shown, small, wholeCount } from "./cards.js";
 import { Detail } from "./detail.js";
 import { isQuestion } from "./grammar.js";
 import { Kept, readFields, Steps, written, MOST_PROMPTS } from "./history.js";
@@ -13,8 +13,7 @@ import { Tour } from "./tour.js";
 import { parsePrompts, tidy } from "./vocabulary.js";
 import { View } from "./view.js";
 
-const TYPING = 500, MOST_TRIED = 6, TIE = 0.02, HALF = "50"; // milliseconds until negatives take effect; suggested words; relevancies that tell words apart; how many floaters a page hides at first
-const $ = (id) => document.getElementById(id);
+const MOST_TRIED = 6, TIE = 0.02, HALF = "50"; // suggested words; relevancies that tell words apart; how many floaters a page hides at first
 const prompts = [], taughtHere = new Set(); // names that were taught to the server's scene from here
 let about, view, photos, list, tour, steps, kept, latest = null, settled = false, cleared = 0; // settled: the address has been read; cleared: how often all prompts were removed
 let ends = [], outlining = null, chosenLook = "";
@@ -26,12 +25,15 @@ const think = thinker(
 
 // ── asking ──
 
+/** Names of the words that this browser keeps. */
+const ownNames = () => kept.words.map(({ name }) => String(name));
 /** Names that hold words such as *and*, which separate prompts elsewhere. */
-const names = () => [...about.names, ...kept.list("words").map(({ name }) => String(name))];
-const commonNegatives = () => $("not").value.split(/[,;]/).map(tidy).filter(Boolean);
+const names = () => [...about.names, ...ownNames()];
+/** Words to offer: own ones, those that the scene answers surely, and all others. */
+const words = () => [...new Set([...ownNames(), ...about.suggested, ...about.known])];
 
-/** Describe a prompt, with the common negatives, for the worker. */
-const question = ({ text, negatives, examples, inScene }) => ({ text, negatives: [...negatives, ...commonNegatives()], examples: inScene ? null : examples });
+/** Describe a prompt for the worker. */
+const question = ({ text, negatives, examples, inScene }) => ({ text, negatives, examples: inScene ? null : examples });
 
 /** Answer a prompt anew. */
 async function answer(prompt) {
@@ -39,27 +41,17 @@ async function answer(prompt) {
   if (prompt.examples && !prompt.examples.length) return Object.assign(prompt, { known: true, relevancy: null, threshold: null });
   const found = await think("ask", { ...question(prompt), threshold: prompt.chosen });
   if (turn !== prompt.turn || !found.known) return found;
-  return Object.assign(prompt, found, { matching: wholeCount(found.matching, about), views: null, box: null, finding: null });
-}
-
-/** Answer all prompts anew, once the common negatives have changed. */
-async function answerAll() {
-  $("near").replaceChildren();
-  for (const prompt of prompts) {
-    const found = await answer(prompt);
-    if (!found.known) offerClosest(found, prompt);
-  }
-  draw();
+  return Object.assign(prompt, found, { matching: wholeCount(found.matching, about), views: null, finding: null });
 }
 
 /** Find the views that show prompts best, once their heat is drawn. */
 function findPlaces() {
   for (const prompt of prompts.filter((one) => one.relevancy && !one.finding && !one.dragged)) {
     const { relevancy, threshold, turn } = prompt;
-    prompt.finding = think("find", { relevancy, threshold }).then((places) => {
+    prompt.finding = think("find", { relevancy, threshold }).then((views) => {
       if (turn !== prompt.turn) return;
-      Object.assign(prompt, places);
-      prompt.card.querySelector(".fly").disabled = !places.views.some((one) => one.shown);
+      prompt.views = views;
+      prompt.card.querySelector(".fly").disabled = !views.some((one) => one.shown);
     });
   }
 }
@@ -92,7 +84,6 @@ async function ask(typed, turn = cleared) {
     }
     const card = old ?? same() ?? prompt; // the same prompt may have been answered in the meantime
     if (!card.color) add(card);
-    kept.store("prompts", [text, ...kept.list("prompts").filter((other) => other !== text)]);
     draw(settled ? card : null);
     if (found.meant && found.trust.level !== "sure") offerMeant(found.meant, card);
   }
@@ -114,23 +105,19 @@ function add(prompt) {
 /** Offer the word that a misspelled one most likely means; a click puts it in its place. */
 function offerMeant(meant, prompt) {
   const mend = () => (prompts.includes(prompt) && remove(prompt), ask(asTyped({ text: meant, negatives: prompt.negatives })));
-  $("near").replaceChildren("Did you mean ", choice(meant, mend), "?");
+  $("near").replaceChildren("Did you mean ", small(meant, () => attempt(mend)), "?");
 }
 
-/** Offer the words closest to an unknown one; a click puts a word in its place, in the prompt and in "But not". */
+/** Offer the words closest to an unknown one; a click puts a word in its place. */
 function offerClosest({ unknown, closest }, { text, negatives }) {
-  async function mend(word) {
-    const mended = (one) => (one === unknown ? word : one), common = commonNegatives();
-    $("not").value = common.map(mended).join(", ");
-    if (common.includes(unknown)) await answerAll();
-    return ask(asTyped({ text: mended(text), negatives: negatives.map(mended) }));
-  }
-  const words = closest.map((word) => choice(word, () => mend(word)));
-  $("near").replaceChildren(`This page doesn't know “${shown(unknown)}”: it answers ${about.known.toLocaleString("en")} words by itself. `,
-    words.length ? "Closest: " : "", ...words); // prettier-ignore
+  const mended = (word) => ({ text: text === unknown ? word : text, negatives: negatives.map((one) => (one === unknown ? word : one)) });
+  const buttons = closest.map((word) => askFor(word, asTyped(mended(word))));
+  $("near").replaceChildren(`This page doesn't know “${shown(unknown)}”: it answers ${about.known.length.toLocaleString("en")} words by itself. `,
+    buttons.length ? "Closest: " : "", ...buttons); // prettier-ignore
 }
 
-const choice = (label, act) => element("button", { className: "small", onclick: () => attempt(act) }, label);
+/** Create a button that asks for a word. */
+const askFor = (word, typed = quoted(word), label = word) => small(label, () => attempt(() => ask(typed)));
 const unusedColor = () => about.colors.find((color) => prompts.every((prompt) => prompt.color !== color)) ?? about.colors[prompts.length % about.colors.length];
 
 /** Take away messages about what was done before. */
@@ -150,27 +137,15 @@ async function attempt(work) {
 
 // ── showing ──
 
-/** Show all prompts, and scroll to `newest`, for small panels. */
+/** Show all prompts, and scroll to `newest`, for small panels. A card stays in its place while one types in it. */
 function draw(newest = null) {
   const acts = { fly, remove, rename, dragThreshold, setThreshold, teach, outline, save, forget }, focused = document.activeElement;
+  const from = focused.closest("#prompts > li"), label = focused.ariaLabel ?? focused.textContent, shownHere = $("prompts").children;
   list.tidy();
-  const [from, label] = [prompts.find(({ card }) => card?.contains(focused)), focused?.ariaLabel ?? focused?.textContent];
-  const naming = from && focused.matches("header input"), typing = naming && focused.value !== focused.defaultValue;
-  const selected = naming && [focused.selectionStart, focused.selectionEnd];
-  for (const prompt of prompts) {
-    prompt.card = promptCard(prompt, acts, about);
-    prompt.card.append(list.part(prompt) ?? "");
-  }
-  if (typing) {
-    focused.kept = true; // a name that is half typed when an answer arrives: it leaves the page for a moment, but isn't done
-    from.card.querySelector("header input").replaceWith(focused);
-  }
-  $("prompts").replaceChildren(...prompts.map(({ card }) => card));
-  [...(from?.card.querySelectorAll("button, input, summary") ?? [])].find((one) => (one.ariaLabel ?? one.textContent) === label)?.focus();
-  if (naming) {
-    focused.kept = false;
-    from.card.querySelector("header input").setSelectionRange(...selected);
-  }
+  for (const prompt of prompts) promptCard(prompt, acts, about).append(list.part(prompt) ?? "");
+  for (const card of [...shownHere]) if (!prompts.some((prompt) => prompt.card === card)) card.remove();
+  prompts.forEach(({ card }, k) => shownHere[k] === card || $("prompts").insertBefore(card, shownHere[k] ?? null));
+  if (!focused.isConnected) [...(from?.querySelectorAll("button, input, summary") ?? [])].find((one) => (one.ariaLabel ?? one.textContent) === label)?.focus();
   $("try").hidden = prompts.length > 0;
   view.recolor(prompts.filter((prompt) => prompt.relevancy));
   newest?.card.scrollIntoView({ block: "nearest" });
@@ -187,10 +162,10 @@ function fly(prompt) {
   const views = prompt.views.filter((one) => one.shown);
   if (!views.length) return;
   prompt.place = ((prompt.place ?? -1) + 1) % views.length;
-  const best = views[prompt.place], middle = prompt.box?.low.map((value, axis) => (value + prompt.box.high[axis]) / 2);
+  const best = views[prompt.place];
   photos.hide();
   view.mover.walk(false);
-  view.mover.flyTo(about.views[best.index], middle);
+  view.mover.flyTo(about.views[best.index], best.target);
   say(`View ${prompt.place + 1} of ${views.length}: ${best.name}; ${percent(best.area)} of it matches.`);
 }
 
@@ -223,7 +198,7 @@ function dragThreshold(prompt, value) {
 
 function setThreshold(prompt, value) {
   dragThreshold(prompt, value);
-  Object.assign(prompt, { dragged: false, finding: null, views: null, box: null, turn: {} });
+  Object.assign(prompt, { dragged: false, finding: null, views: null, turn: {} });
   quiet(); // what was told of the view counted the matches of before
   draw();
 }
@@ -263,11 +238,11 @@ async function tell({ x, y, without }) {
   if (list.pick(rows)) return;
   const best = words[0]?.[1] ?? 0;
   const tied = words.filter(([, score]) => score > best - TIE), several = tied.length > 2;
-  const buttons = (several ? tied : words).map(([word, score]) => choice(several ? word : `${word} ${percent(score)}`, () => ask(quoted(word))));
+  const buttons = (several ? tied : words).map(([word, score]) => askFor(word, quoted(word), several ? word : `${word} ${percent(score)}`));
   quiet();
   const told = several ? "Here several words fit equally well, so none is sure:" : "Here, words that fit best:";
   $("here").replaceChildren(element("p", {}, words.length ? told : `Nothing is there${rows.length ? " that has a name" : ""}.`),
-    element("div", {}, ...buttons, ...(rows.length ? [choice("Like this", () => likeThis([[x, y]]))] : []))); // prettier-ignore
+    element("div", {}, ...buttons, ...(rows.length ? [small("Like this", () => attempt(() => likeThis([[x, y]])))] : []))); // prettier-ignore
   $("here").hidden = false;
 }
 
@@ -367,7 +342,7 @@ function save(prompt) {
 }
 
 async function forget(prompt) {
-  kept.store("words", kept.list("words").filter(({ name }) => name !== prompt.text));
+  kept.words = kept.words.filter(({ name }) => name !== prompt.text);
   remove(prompt);
   if (!taughtHere.delete(prompt.text)) return;
   await post("api/teach", { name: prompt.text, before: prompt.text, examples: [] });
@@ -376,13 +351,12 @@ async function forget(prompt) {
 
 /** Keep a named word in this browser; it replaces those with its present and former name. */
 function keepWord({ text, examples, named }, before = text) {
-  const others = kept.list("words").filter(({ name }) => ![text, before].includes(name));
-  if (named) kept.store("words", [{ name: text, examples }, ...others]);
+  if (named) kept.words = [{ name: text, examples }, ...kept.words.filter(({ name }) => ![text, before].includes(name))];
 }
 
 /** Return a word that was named in this browser as a prompt; null if there is none. */
 function namedWord(text) {
-  const found = kept.list("words").find(({ name }) => name?.toLowerCase() === text.toLowerCase());
+  const found = kept.words.find(({ name }) => name?.toLowerCase() === text.toLowerCase());
   return found && areExamples(found.examples, about.count) ? { text: found.name, examples: found.examples, named: true } : null;
 }
 
@@ -400,7 +374,7 @@ function asField(prompt) {
 const shownNow = (stops = tour.fields) =>
   written({
     stops,
-    view: view.mover.address, walk: view.mover.walking ? 1 : "", not: $("not").value, hide: $("hide").value === HALF ? "" : $("hide").value, look: chosenLook,
+    view: view.mover.address, walk: view.mover.walking ? 1 : "", hide: $("hide").value === HALF ? "" : $("hide").value, look: chosenLook,
     unit: about.unit, cameras: $("cameras").ariaPressed === "true" ? 1 : "", photo: photos.shown?.name, ...list.fields,
     prompts: prompts.filter(({ examples }) => !examples || examples.length).map(asField),
   }); // prettier-ignore
@@ -425,12 +399,10 @@ async function apply(hash, turn = drop(), isStop = false) {
   $("hide").value = wanted.hide ?? HALF;
   hideFloaters();
   attempt(() => chooseLook(wanted.look ?? ""));
-  const common = $("not").value !== (wanted.not ?? "");
-  $("not").value = wanted.not ?? "";
   try {
     const listed = wanted.prompts.flatMap((one) => specify(one).map((specified) => [one, specified]));
     for (const [one, specified] of about.words ? listed.slice(0, MOST_PROMPTS) : []) {
-      const old = common ? null : prompts.find((prompt) => String(Object.values(asField(prompt)).slice(0, 3)) === String(Object.values(asField({ ...specified, color: null })).slice(0, 3)));
+      const old = prompts.find((prompt) => String(Object.values(asField(prompt)).slice(0, 3)) === String(Object.values(asField({ ...specified, color: null })).slice(0, 3)));
       const prompt = old ?? specified, answered = old ?? (await answer(prompt));
       if (turn !== cleared) return;
       if (!answered.known) offerClosest(answered, prompt);
@@ -465,18 +437,10 @@ function settle(hash = null) {
 
 // ── controls ──
 
-async function offer() {
-  const typed = $("word").value.split(";").at(-1), before = $("word").value.slice(0, $("word").value.length - typed.length);
-  const own = kept.list("words").map(({ name }) => String(name)), start = tidy(typed).toLowerCase(), offered = await think("offered", { typed });
-  const words = start ? [...own.filter((name) => name.toLowerCase().includes(start)), ...offered] : [...own, ...about.suggested, ...kept.list("prompts").map(String), ...offered];
-  $("offered").replaceChildren(...[...new Set(words)].map((word) => element("option", { value: before + word })));
-}
-
-/** Suggest words to a visitor who has asked nothing yet. */
-async function suggest() {
-  const known = about.suggested.length ? about.suggested : await think("offered", { typed: "" });
-  const words = [...new Set([...kept.list("words").map(({ name }) => String(name)), ...known])];
-  $("try").replaceChildren("Try: ", ...words.slice(0, MOST_TRIED).map((word) => choice(word, () => ask(quoted(word)))));
+/** Offer words while the user types; the browser chooses among them. */
+function offer() {
+  const typed = $("word").value, before = typed.slice(0, typed.lastIndexOf(";") + 1);
+  $("offered").replaceChildren(...words().map((word) => element("option", { value: before + word })));
 }
 
 function on(id, kind, act) {
@@ -484,22 +448,18 @@ function on(id, kind, act) {
 }
 
 function listen() {
-  let typing, moving;
+  let moving;
   on("ask", "submit", (event) => {
     event.preventDefault();
     const typed = $("word").value;
     $("word").value = "";
     return tidy(typed) ? ask(typed) : null;
   });
-  for (const kind of ["input", "focus"]) $("word").addEventListener(kind, () => reading.then(offer));
-  $("not").addEventListener("input", () => {
-    clearTimeout(typing);
-    typing = setTimeout(() => attempt(answerAll), TYPING);
-  });
+  for (const kind of ["input", "focus"]) on("word", kind, () => reading.then(offer));
   on("clear", "click", clear);
   on("overview", "click", () => (photos.hide(), quiet(), view.mover.overview()));
   on("teach", "click", () => startWord().card.querySelector("button").focus()); // no name yet: a phone's keyboard would cover the view
-  on("still", "click", saveStill);
+  on("still", "click", async () => download("scene.png", await view.picture()));
   on("link", "click", copyLink);
   on("look", "change", () => chooseLook($("look").value).then(() => keepAddress()));
   on("hide", "input", hideFloaters);
@@ -569,11 +529,6 @@ function download(name, content) {
   setTimeout(() => URL.revokeObjectURL(link.href), 1000);
 }
 
-async function saveStill() {
-  const lines = prompts.map((prompt) => [shown(prompt.text), `rgb(${prompt.color})`]);
-  download("scene.png", await view.picture(lines));
-}
-
 async function copyLink() {
   keepAddress();
   await navigator.clipboard.writeText(location.href);
@@ -616,7 +571,7 @@ async function open() {
   $("credit").textContent = [about.credit, about.license, about.made, ...about.left_out].filter(Boolean).join("\n");
   $("lighting").hidden = !Object.keys(about.looks).length;
   $("look").append(...Object.keys(about.looks).map((name) => element("option", { value: name }, name)));
-  for (const control of [...$("ask").elements, $("not"), $("teach")]) control.disabled = !about.words;
+  for (const control of [...$("ask").elements, $("teach")]) control.disabled = !about.words;
   const splats = await (await fetched("splats.bin")).arrayBuffer();
   await unpacked;
   view = new View(about, $("frame"));
@@ -628,18 +583,18 @@ async function open() {
     $("undo").disabled = !steps.past;
     $("redo").disabled = !steps.future;
   }); // prettier-ignore
+  Object.assign(window.lang3dxl, { view, tour });
   await view.show(splats);
   listen();
   return splats;
 }
 
 async function readMeaning(splats) {
-  if (!about.words) return say("This scene has colors alone: it can't be asked.");
-  say("Reading what the scene means…");
-  const { seconds, known } = await think("load", { description: about, splats });
-  Object.assign(about, { known, seconds });
   say(explain(about));
-  attempt(suggest);
+  if (!about.words) return;
+  about.known = await think("load", { description: about, splats });
+  say(explain(about));
+  $("try").replaceChildren("Try: ", ...words().slice(0, MOST_TRIED).map((word) => askFor(word)));
 }
 
 /** Read which Gaussians float, once the page answers. */
@@ -670,14 +625,5 @@ window.lang3dxl = {
   clear,
   whatIs,
   prompts,
-  get tour() {
-    return tour;
-  },
-  get view() {
-    return view;
-  },
-  get seconds() {
-    return about.seconds;
-  },
 };
 window.lang3dxl.ready.catch((error) => "told" in $("status").dataset || say(error.message)); // start.js may have said why

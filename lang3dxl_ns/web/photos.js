@@ -1,8 +1,7 @@
 // Photos: a strip of them, one over the rendering with a divider, and the cameras that took them.
-import { element, say } from "./cards.js";
+import { $, element, say } from "./cards.js";
 
 const LONG = 0.07; // length of a drawn camera, share of the overview's depth
-const $ = (id) => document.getElementById(id);
 
 export class Photos {
   /** about: the page's description; view: the picture; looks: called with a photo's name, to show its lighting. */

@@ -24,7 +24,7 @@ MOST_CAMERAS = 400
 """Most photos whose cameras a page knows; evenly spaced ones are kept."""
 _ROOM = 1.06
 """Room around what the overview shows besides its photo."""
-_CUT, _WIDER, _STEEP, _BEHIND, _LARGE = 0.001, 2.0, 0.9, 1.5, 3.0
+_CUT, _WIDER, _STEEP, _BEHIND, _LARGE = 0.0003, 2.0, 0.9, 1.5, 3.0
 """Share of what a scene's views show that may lie beyond each side of the overview; how much farther than its
 photo an overview reaches, and up to which slope; how much farther than the middle of the scene what it shows
 may lie; and how much larger than most a Gaussian is that shows sky or ground."""

@@ -1,9 +1,8 @@
 // A tour: views that one keeps with their words and a caption, in the page's link, and played in order.
-import { element } from "./cards.js";
+import { $, element, small } from "./cards.js";
 
 const MOST_STOPS = 30, MOST_CAPTION = 300;
 const PAUSE = 4000, LETTER = 60; // milliseconds at a stop, and for each letter of its caption
-const $ = (id) => document.getElementById(id);
 
 export class Tour {
   /** here: returns what is shown, as an address without a tour; go: flies to an address, and resolves once its words are
@@ -48,13 +47,12 @@ export class Tour {
   }
 
   row(stop, k) {
-    const small = (label, ariaLabel, onclick, disabled = false) => element("button", { className: "small", ariaLabel, onclick, disabled }, label);
     const caption = element("input", { value: stop.caption, maxLength: MOST_CAPTION, placeholder: "Caption", ariaLabel: `Caption of stop ${k + 1}` });
     caption.addEventListener("change", () => ((stop.caption = caption.value.trim()), this.changed()));
     const change = (...splice) => (this.stops.splice(...splice), this.draw(), this.changed());
     const earlier = () => change(k - 1, 2, stop, this.stops[k - 1]), remove = () => change(k, 1);
-    return element("li", {}, small(`${k + 1}`, `Go to stop ${k + 1}`, () => this.go(stop.hash)), caption,
-      small("↑", `Move stop ${k + 1} up`, earlier, k === 0), small("×", `Remove stop ${k + 1}`, remove)); // prettier-ignore
+    return element("li", {}, small(`${k + 1}`, () => this.go(stop.hash), { ariaLabel: `Go to stop ${k + 1}` }), caption,
+      small("↑", earlier, { ariaLabel: `Move stop ${k + 1} up`, disabled: k === 0 }), small("×", remove, { ariaLabel: `Remove stop ${k + 1}` })); // prettier-ignore
   }
 
   /** Fly from stop to stop, until the user does anything else. pause: milliseconds at each, besides its caption's. */

@@ -28,7 +28,6 @@ export class View extends EventTarget {
     this.mover.addEventListener("release", () => (this.held = false));
     new ResizeObserver(() => this.resize()).observe(frame);
     this.resize();
-    this.mover.place(this.mover.overviewStand());
     this.listen();
   }
 
@@ -40,6 +39,7 @@ export class View extends EventTarget {
     this.scene.add(root.mesh);
     this.root = root;
     this.parts.set(0, root);
+    this.mover.place(this.mover.overviewStand()); // now that the page's strip of photos covers its part
     this.recolor();
   }
 
@@ -225,23 +225,9 @@ export class View extends EventTarget {
     this.canvas.addEventListener("webglcontextrestored", () => this.upload());
   }
 
-  /** Draw the picture as a PNG, with lines of text ([text, color]) below. */
-  async picture(lines) {
+  /** Return the picture as a PNG. */
+  picture() {
     this.draw(1);
-    const canvas = document.createElement("canvas"), size = Math.max(this.canvas.width / 48, 14);
-    [canvas.width, canvas.height] = [this.canvas.width, this.canvas.height + lines.length * 1.6 * size];
-    const pen = canvas.getContext("2d");
-    pen.fillStyle = getComputedStyle(this.frame).getPropertyValue("--panel");
-    pen.fillRect(0, 0, canvas.width, canvas.height);
-    pen.drawImage(this.canvas, 0, 0);
-    pen.font = `${size}px system-ui, sans-serif`;
-    lines.forEach(([text, color], k) => {
-      const top = this.canvas.height + (1.6 * k + 0.3) * size;
-      pen.fillStyle = color;
-      pen.fillRect(size / 2, top, size, size);
-      pen.fillStyle = "#fff";
-      pen.fillText(text, 2 * size, top + 0.85 * size, canvas.width - 2.5 * size);
-    });
-    return new Promise((done) => canvas.toBlob(done, "image/png"));
+    return new Promise((done) => this.canvas.toBlob(done, "image/png"));
   }
 }

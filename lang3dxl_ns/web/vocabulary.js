@@ -136,17 +136,9 @@ export class Vocabulary {
     return scored.sort((a, b) => b[1] - a[1]).slice(0, most).map(([word]) => word);
   }
 
-  /** Find words to offer while the user types. */
-  offered(typed, most = 12) {
-    const start = tidy(typed).toLowerCase(), first = [], later = [];
-    const taught = Object.keys(this.taught).map((i) => this.words[i]);
-    for (const word of new Set([...taught, ...this.words])) {
-      const at = word.toLowerCase().indexOf(start);
-      if (at === 0) first.push(word);
-      else if (at > 0 && later.length < most) later.push(word);
-      if (first.length >= most) break;
-    }
-    return [...first, ...later].slice(0, most);
+  /** All words, taught ones first, to offer while the user types. */
+  get listed() {
+    return [...new Set([...Object.keys(this.taught).map((i) => this.words[i]), ...this.words])];
   }
 }
 

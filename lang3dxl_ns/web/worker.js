@@ -1,7 +1,7 @@
 // Worker that runs beside the drawing: it decodes the scene once, then answers words and clicks.
 import { Answers } from "./answer.js";
 import { decodedRows, shippedRows } from "./decode.js";
-import { boxAround, massOf, rankViews, readViews } from "./find.js";
+import { massOf, rankViews, readViews } from "./find.js";
 import { likeness } from "./like.js";
 import { bestPhoto, gaussiansAt, middleOf, unpackSplats } from "./pick.js";
 import { freeSpace } from "./space.js";
@@ -79,12 +79,14 @@ function meantAt(camera, x, y) {
 
 const hitsAt = (camera, x, y) => gaussiansAt([...parts.values()].map(({ geometry }) => geometry), camera, x, y, about.antialiased);
 
+/** Move a point into the world's frame. */
+const inWorld = (point) => point.map((value, axis) => value + about.center[axis]);
 const bytes = async (name) => (await file(name)).arrayBuffer();
 
 const jobs = {
   async load({ description, splats }) {
     about = description;
-    const { words } = about, start = performance.now();
+    const { words } = about;
     const [listed, numbers] = [await (await file("vocabulary.json")).json(), await bytes("vocabulary.bin")];
     vocabulary = new Vocabulary(listed, numbers, words.width, about.live);
     const tell = (done) => new Promise((go) => (postMessage({ done }), setTimeout(go)));
@@ -101,7 +103,7 @@ const jobs = {
     mass = massOf(views, words.count);
     known = new Known(mass);
     answers.foreground = await foregroundOf(about.foreground);
-    return { seconds: (performance.now() - start) / 1000, known: vocabulary.words.length };
+    return vocabulary.listed;
   },
 
   /** Answer a phrase or examples with { known, relevancy, threshold, doubt, … }. */
@@ -138,19 +140,15 @@ const jobs = {
   },
 
   find({ relevancy, threshold }) {
-    const moved = (corner) => corner.map((value, axis) => value + about.center[axis]);
-    const box = boxAround(geometry.centers, relevancy, mass, threshold, about.words.gap);
-    return {
-      views: rankViews(views, geometry.centers, relevancy, threshold),
-      box: box && { low: moved(box.low), high: moved(box.high) },
-    };
+    const ranked = rankViews(views, geometry.centers, relevancy, threshold);
+    return ranked.map((view) => ({ ...view, target: inWorld(view.target) }));
   },
 
   /** Find the single things of an answer: { things, candidates }. */
   things({ relevancy }) {
     if (!isPresent(relevancy, about.words.rules)) return { things: [], candidates: [] };
     const found = thingsOf(views, { ...geometry, mass, gap: about.words.gap, edges: about.edges }, relevancy);
-    const placed = (thing) => ({ ...thing, center: thing.center.map((value, axis) => value + about.center[axis]) });
+    const placed = (thing) => ({ ...thing, center: inWorld(thing.center) });
     return { things: found.things.map((thing) => placed({ ...thing, id: known.id(thing) })), candidates: found.candidates.map(placed) };
   },
 
@@ -179,13 +177,13 @@ const jobs = {
   /** Find the free space in the world's frame; null where no view tells. */
   space() {
     const space = freeSpace(views, geometry.centers);
-    return space && { ...space, low: space.low.map((value, axis) => value + about.center[axis]) };
+    return space && { ...space, low: inWorld(space.low) };
   },
 
   /** Find the point of the world at a pixel; null where nothing is. */
   point({ camera, x, y }) {
     const middle = middleOf(hitsAt(camera, x, y));
-    return middle && middle.map((value, axis) => value + about.center[axis]);
+    return middle && inWorld(middle);
   },
 
   /** Mark pixels: the Gaussians that represent them, and each pixel's place in one photo that shows them all well, or
@@ -209,8 +207,6 @@ const jobs = {
     for (const text of texts) vocabulary.forget(text);
     return {};
   },
-
-  offered: ({ typed }) => vocabulary.offered(typed),
 };
 
 onmessage = async ({ data: { id, job, input } }) => {

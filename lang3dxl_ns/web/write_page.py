@@ -61,7 +61,7 @@ _SUGGESTED = (
 )  # fmt: skip
 """Words that a first visitor is offered, where the scene knows them."""
 _NUMBERS = (
-    ("ranking", view_ranking, "PEAK LARGE RIM STRONG CORE JOINED OUTLIERS DENSE"),
+    ("ranking", view_ranking, "PEAK LARGE RIM STRONG"),
     ("things", pieces, "LEVELS PART DEPTH FILLED"),
     ("things", join, "SHARED SPLINTER VIEWS CRUMB OFTEN SLIM STRAIGHT"),
     ("things", thing, "OUTLIERS"),

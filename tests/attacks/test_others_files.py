@@ -76,7 +76,7 @@ def test_a_store_enters_no_linked_folder(tmp_path):
     other.write("clip", "a.jpg", {"x": torch.ones(3)}, SETTINGS)
     store.write("clip", "b.jpg", {"x": torch.ones(3)}, SETTINGS)
     (store.root / "zz").symlink_to(other.root / "clip")
-    assert store.clean([], [])[0] == 1 and "zz" not in store.sizes()
+    assert "zz" not in store.sizes()
     assert other.read("clip", "a.jpg")["x"].sum() == 3
     with pytest.raises(UserError, match="is a link"):
         store.write("zz", "a.jpg", {"x": torch.ones(3)}, SETTINGS)
@@ -125,16 +125,6 @@ def test_forgetting_an_example_that_no_number_names_is_one_line(number, word):
     scene = painted_scene().with_words([replace(word, vector=torch.ones(CHANNELS))])
     with pytest.raises(UserError, match="was not taught: lang3dxl words lists"):
         forgotten(scene, f"gizmo/{number}")
-
-
-def test_of_a_shared_store_other_scenes_entries_stay(tmp_path, capsys):
-    store = FeatureStore(tmp_path)
-    for kind in ("clip", "dense"):
-        for name in ("a.jpg", "b.jpg"):
-            store.write(kind, name, {"x": torch.ones(3)}, SETTINGS)
-    assert store.clean(["clip"], ["a.jpg"], shared=True)[0] == 1  # a's dense features
-    assert "2 entries of other photos stay" in capsys.readouterr().out
-    assert store.clean(["clip"], ["a.jpg"])[0] == 2
 
 
 def test_an_altered_entry_is_noticed_also_where_times_are_whole_seconds(tmp_path):

@@ -8,7 +8,6 @@ from painted_scene import painted_scene
 
 from lab.benchmarks import attach
 from lab.benchmarks.published import HolyScenes, published_figures
-from lab.benchmarks.scale import ScaleBenchmark, Stage, markdown
 from lab.benchmarks.teaching import ways
 from lang3dxl_ns import cli
 
@@ -62,13 +61,6 @@ def test_ours_stand_beside_the_published_figures_of_their_scene_and_category():
         assert row["AP as published"] == ours and row["Lang3D-XL, published"] == theirs
     assert "| photos pooled | windows | 4 | 0.375 |" in together
     assert "| mean of scenes | windows | " in together and "| 0.550 |" in together
-
-
-def test_a_stage_of_scale_is_a_row():
-    stages = [Stage("words", "20,000 Gaussians", 12.34, 9.87, "0.5 s", 2_500_000_000)]
-    report = markdown(ScaleBenchmark(out=Path("x")), stages)
-    assert "| words | 20,000 Gaussians | 12.3 | 9.9 | 0.5 s | 2.50 |" in report
-    assert "lang3dxl benchmark scale --out x" in report
 
 
 @pytest.mark.parametrize("name", ways(2))

@@ -1,6 +1,6 @@
 """nerfstudio's commands on our method, as in the README.
 
-A shell starts `ns-train` and `ns-eval`; the others import what `ns-eval` does, and load a run as it does.
+A shell starts `ns-train`; the others import what it does, and find the method as it does.
 """
 
 import json
@@ -55,7 +55,7 @@ def test_prepare_alone(scene, tiny_clip, tiny_dense, folder):
 
 def test_eval(run, folder):
     words = ("ns-eval", "--load-config", run / "config.yml", "--output-path", folder / "eval.json")
-    command(*words, cwd=folder, shell=True)
+    command(*words, cwd=folder)
     results = json.loads((folder / "eval.json").read_text())["results"]
     assert {"psnr", "ssim", "clip_l1", "clip_psnr", "clip_cosine", "psnr_std"} <= set(results)
 

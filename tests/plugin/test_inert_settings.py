@@ -38,10 +38,6 @@ def test_the_help_does_not_offer_them(capsys):
 @pytest.mark.parametrize(
     ("path", "value"),
     [
-        ("pipeline.model.stop_split_at", 0),
-        ("pipeline.model.refine_every", 7),
-        ("pipeline.model.use_bilateral_grid", True),
-        ("pipeline.datamanager.cache_images", "cpu"),
         ("pipeline.model.clip_weight", 0.0),
         ("pipeline.model.dense_weight", 0.5),
         ("pipeline.model.decode_size", (80, 120)),

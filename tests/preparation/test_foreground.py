@@ -12,7 +12,7 @@ from tiny_models import make_tiny_clipseg
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.preparation import foreground
-from lang3dxl_ns.preparation.foreground import foreground_kind, with_foreground
+from lang3dxl_ns.preparation.foreground import with_foreground
 from lang3dxl_ns.preparation.segmentation import ClipSeg
 from lang3dxl_ns.preparation.settings import PreparationConfig
 from lang3dxl_ns.preparation.store import FeatureStore
@@ -212,7 +212,3 @@ def test_masks_of_other_prompts_stay(photos, config, tmp_path):
     second = with_foreground(photos, other, tmp_path, tmp_path / "cache", "cpu", print)
     assert not {photo.mask_path for photo in first} & {photo.mask_path for photo in second}
     assert [photo.mask_path.read_bytes() for photo in first] == kept
-    store = FeatureStore(tmp_path / "cache")
-    store.clean([foreground_kind(config)], NAMES)
-    assert all(photo.mask_path.is_file() for photo in first)
-    assert not any(photo.mask_path.is_file() for photo in second)

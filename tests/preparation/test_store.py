@@ -262,19 +262,6 @@ def test_photos_are_hashed_once_and_again_only_when_their_files_change(store, tm
     assert store.photo_hashes(photos)["a.png"] == first["a.png"]
 
 
-def test_cleaning_keeps_what_is_named_and_reports_what_went(store):
-    for kind in ("clip", "dense"):
-        for name in ("a.jpg", "b.jpg"):
-            store.write(kind, name, entry(), SETTINGS)
-    mask = store.path("foreground", "a.jpg").with_suffix(".png")
-    store.write_bytes(mask, b"mask", "a mask")
-    going = store.path("clip", "b.jpg").stat().st_size + 4
-    going += sum(store.path("dense", name).stat().st_size for name in ("a.jpg", "b.jpg"))
-    assert store.clean(["clip"], ["a.jpg"]) == (4, going)
-    assert files(store) == [store.path("clip", "a.jpg").name]
-    assert store.sizes()["dense"] == (0, 0)
-
-
 def test_files_of_others_in_the_folder_are_never_deleted(store):
     """Such as the photos themselves, where the store's folder is theirs."""
     names = ("images/0001.jpg", "masks/0001.png", "models/clip.safetensors", "notes/draft.tmp")
@@ -282,5 +269,5 @@ def test_files_of_others_in_the_folder_are_never_deleted(store):
         path.parent.mkdir(parents=True)
         path.write_bytes(b"mine")
         os.utime(path, (0, 0))
-    assert store.clean([], []) == (0, 0)
+    store.remove_leftovers()
     assert all(store.root.joinpath(name).is_file() for name in names)

@@ -79,7 +79,6 @@ def test_a_taught_word_is_answered_as_by_python(answering):
         found = think("ask", text=typed, negatives=negatives, threshold=None)
         np.testing.assert_allclose(found["relevancy"], question.relevancy[0].numpy(), atol=2.5e-3)
         assert (found["taught"], found["threshold"], found["doubt"]) == (True, 0.5, 0.04)
-    assert "Lych gate" in think("offered", typed="lych")
 
 
 def test_a_place_has_the_words_of_python(answering):
@@ -98,18 +97,18 @@ def test_a_place_has_the_words_of_python(answering):
     assert named > 5
 
 
-def test_views_and_boxes_are_those_of_python(scene, answering):
+def test_views_are_those_of_python_and_turn_around_what_they_show(scene, answering):
     own, think = answering
     if own.decoder.name != "painted" or own.config.foreground or float(own.splats.quats[0, 0]) != 1:
         pytest.skip("for the painted wall as it is")
     for word in ("windows", "dome"):
         expected, found = scene.find(word), think("ask", text=word, negatives=[], threshold=None)
-        places = think("find", relevancy=found["relevancy"], threshold=found["threshold"])
-        shown = [view["name"] for view in places["views"] if view["shown"]]
+        views = think("find", relevancy=found["relevancy"], threshold=found["threshold"])
+        shown = [view["name"] for view in views if view["shown"]]
         assert shown == [view.name for view in expected.views]
-        assert places["views"][0]["rank"] == pytest.approx(expected.views[0].rank, abs=0.03)
-    box = places["box"]  # of the dome: which of the two windows wins is open
-    np.testing.assert_allclose([box["low"], box["high"]], [expected.box.low, expected.box.high], atol=0.1)
+        assert views[0]["rank"] == pytest.approx(expected.views[0].rank, abs=0.03)
+    middle = np.mean([expected.box.low, expected.box.high], axis=0)  # of the dome
+    np.testing.assert_allclose(views[0]["target"], middle, atol=0.2)
 
 
 def test_what_looks_like_a_place_is_found_by_example(scene, answering):

@@ -195,5 +195,7 @@ def test_an_overview_reaches_a_spire_and_not_the_sky(scene):
     plain = overview(building, [0.03] * len(building), [1.0] * len(building))
     assert plain[1] == pytest.approx(1.06 * 1.2 * top, rel=0.02)
     assert [plain[0], *plain[2:4]] == pytest.approx([left, right, bottom], rel=0.1)
+    thin = overview(building, [0.03] * len(building), [1.0] * len(walls) + [0.05] * len(spire))
+    assert thin[1] < 1.06 * 1.1 * top  # a needle, a thousandth of what photos show
     under_sky = overview(whole, [0.03] * len(building) + [2.0] * 300, [1.0] * len(building) + [1e3] * 300)
     assert under_sky == pytest.approx(plain)
