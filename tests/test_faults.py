@@ -7,13 +7,11 @@ import re
 import zipfile
 from copy import deepcopy
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 import torch
 import yaml
 from conftest import make_trainer
-from nerfstudio.cameras.cameras import Cameras, CameraType
 from PIL import Image
 from scenes import write_scene
 
@@ -21,7 +19,6 @@ from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.memory import machine_memory, with_less_memory
 from lang3dxl_ns.methods import lang3dxl
 from lang3dxl_ns.plugin.dataparser import PhotoCollectionDataParserConfig
-from lang3dxl_ns.plugin.nerfstudio_scenes import photos_of
 from lang3dxl_ns.plugin.run_checkpoint import check_checkpoint
 from lang3dxl_ns.plugin.trainer_config import read_config
 from lang3dxl_ns.preparation.foreground import with_foreground
@@ -125,14 +122,6 @@ def test_a_mask_that_fits_two_photos_of_one_stem_is_named_and_the_long_form_tell
     assert lines == []
 
 
-@pytest.mark.parametrize("kind", [CameraType.FISHEYE, CameraType.EQUIRECTANGULAR])
-def test_lenses_that_are_not_undistorted_are_refused_with_the_way_out(tmp_path, kind):
-    cameras = Cameras(torch.eye(4)[None, :3], 50.0, 50.0, 20.0, 15.0, 40, 30, camera_type=kind)
-    outputs = SimpleNamespace(cameras=cameras, image_filenames=[tmp_path / "a.jpg"], mask_filenames=None)
-    with pytest.raises(UserError, match=rf"a\.jpg has a {kind.name.lower()} camera.*nerfstudio-data off"):
-        photos_of(outputs, tmp_path)
-
-
 # ── names and links that lead out of a folder ───────────────────────────────────────────────────────────
 
 
@@ -159,16 +148,6 @@ def test_the_photos_folder_itself_may_be_a_link(folder, tmp_path):
     (folder / "images").rename(tmp_path / "elsewhere")
     (folder / "images").symlink_to(tmp_path / "elsewhere")
     assert len(parse(folder)) == 4
-
-
-def test_other_dataparsers_cannot_name_photos_outside_the_data_either(tmp_path):
-    (tmp_path / "data").mkdir()
-    cameras = Cameras(torch.eye(4)[None, :3], 50.0, 50.0, 20.0, 15.0, 40, 30)
-    outputs = SimpleNamespace(
-        cameras=cameras, image_filenames=[tmp_path / "data" / "../a.jpg"], mask_filenames=None
-    )
-    with pytest.raises(UserError, match="lies outside"):
-        photos_of(outputs, tmp_path / "data")
 
 
 # ── disks ───────────────────────────────────────────────────────────────────────────────────────────────

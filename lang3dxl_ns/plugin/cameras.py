@@ -9,7 +9,6 @@ from jaxtyping import Float
 from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 
-from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.scene.camera import Lens
 from lang3dxl_ns.training.state import PhotoCamera
 
@@ -24,18 +23,6 @@ def to_nerfstudio(lenses: Sequence[Lens], camera_to_worlds: Float[Tensor, "n 3 4
     width, height = column("width", torch.int64), column("height", torch.int64)
     # `ns-export cameras` expects metadata.
     return Cameras(camera_to_worlds, fx, fy, cx, cy, width, height, metadata={})
-
-
-def lens_of(cameras: Cameras, index: int) -> Lens:
-    """Return the lens of a nerfstudio perspective camera. Raises UserError for a fourth radial coefficient,
-    which OpenCV's model doesn't have."""
-    parameters = cameras.distortion_params
-    k1, k2, k3, k4, p1, p2 = [0.0] * 6 if parameters is None else parameters[index].tolist()
-    if k4:
-        raise UserError(f"a perspective camera has k4 = {k4:g}, of a fisheye's model: undistort the photos")
-    fx, fy, cx, cy = (float(values[index]) for values in (cameras.fx, cameras.fy, cameras.cx, cameras.cy))
-    distortion = (k1, k2, p1, p2, k3) if any((k1, k2, k3, p1, p2)) else ()
-    return Lens(int(cameras.width[index]), int(cameras.height[index]), fx, fy, cx, cy, distortion)
 
 
 def photo_camera(camera: Cameras) -> PhotoCamera:

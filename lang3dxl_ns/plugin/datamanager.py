@@ -25,11 +25,11 @@ from lang3dxl_ns.plugin.cameras import to_cameras
 from lang3dxl_ns.plugin.dataparser import (
     PhotoCollectionDataParser,
     PhotoCollectionDataParserConfig,
+    RecordedSceneDataParser,
     parser_for,
     recorded_scene,
 )
 from lang3dxl_ns.plugin.inert_settings import OF_IMAGE_CACHES
-from lang3dxl_ns.plugin.nerfstudio_scenes import capture_of
 from lang3dxl_ns.plugin.photo_dataset import PhotoDataset
 from lang3dxl_ns.preparation.needs import needs_table
 from lang3dxl_ns.preparation.settings import PreparationConfig
@@ -37,7 +37,6 @@ from lang3dxl_ns.preparation.store import FeatureStore
 from lang3dxl_ns.preparation.targets import FACTS, Batch, SceneFacts
 from lang3dxl_ns.preparation.working_photos import WorkingPhotos
 from lang3dxl_ns.scene.camera import LONGEST_SIDE
-from lang3dxl_ns.scene.capture import Capture
 from lang3dxl_ns.scene.companions import cache_folder
 from lang3dxl_ns.scene.record import SCENE_FILE, SceneRecord
 from lang3dxl_ns.training.batches import TrainingData
@@ -88,6 +87,7 @@ class Lang3DXLDataManager(FullImageDatamanager):
     """The photos and targets."""
     train_dataset: PhotoDataset
     eval_dataset: PhotoDataset
+    dataparser: PhotoCollectionDataParser | RecordedSceneDataParser
 
     def __init__(self, config: Lang3DXLDataManagerConfig, *args, **kwargs):
         config.check()
@@ -98,10 +98,7 @@ class Lang3DXLDataManager(FullImageDatamanager):
         try:
             # never find a run's own cameras anew: its Gaussians would not match them
             config.dataparser = parser_for(config.dataparser, config.cache_dir, config.run is None)
-            if isinstance(config.dataparser, PhotoCollectionDataParserConfig):
-                config.data = config.dataparser.data
-            elif hasattr(config.dataparser, "load_3D_points"):
-                config.dataparser.load_3D_points = True  # off by default in some of nerfstudio's
+            config.data = config.dataparser.data
             super().__init__(config, *args, **kwargs)
             if recorded is not None:
                 self._check_recorded(SceneRecord.read(recorded.run / SCENE_FILE))
@@ -127,7 +124,7 @@ class Lang3DXLDataManager(FullImageDatamanager):
 
     def create_train_dataset(self) -> PhotoDataset:
         """Open the photos, and build the dataset of training photos, with facts for the model."""
-        config, capture = self.config, self._capture()
+        config, capture = self.config, self.dataparser.capture
         self.data = TrainingData(
             capture, config, cache_folder(capture.folder, config.cache_dir), self.device,
             config.targets_in_steps, config.camera_res_scale_factor, config.cache_gb, config.read_ahead,
@@ -140,16 +137,8 @@ class Lang3DXLDataManager(FullImageDatamanager):
 
     def create_eval_dataset(self) -> PhotoDataset:
         """Build the dataset of held-out photos."""
-        return self._dataset(self._held_out, self.data.capture.split.held_out)
-
-    def _capture(self) -> Capture:
-        if isinstance(self.dataparser, PhotoCollectionDataParser):
-            return self.dataparser.capture
-        return capture_of(self.train_dataparser_outputs, self._held_out, Path(self.config.dataparser.data))
-
-    @property
-    def _held_out(self) -> DataparserOutputs:
-        return self.dataparser.get_dataparser_outputs(split=self.test_split)
+        outputs = self.dataparser.get_dataparser_outputs(split=self.test_split)
+        return self._dataset(outputs, self.data.capture.split.held_out)
 
     def _dataset(self, outputs: DataparserOutputs, names: tuple[str, ...]) -> PhotoDataset:
         known = {photo.name: photo for photo in self.data.as_read}

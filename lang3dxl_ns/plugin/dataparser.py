@@ -6,7 +6,7 @@ import json
 from dataclasses import dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 import torch
@@ -23,9 +23,10 @@ from lang3dxl_ns.common.files import expanded, write_atomically
 from lang3dxl_ns.common.settings_help import without
 from lang3dxl_ns.plugin.cameras import to_nerfstudio
 from lang3dxl_ns.plugin.inert_settings import OF_COLMAP
-from lang3dxl_ns.scene.capture import Capture, CaptureSettings, find_source, open_capture, say_left_out
+from lang3dxl_ns.scene.camera import view_matrix
+from lang3dxl_ns.scene.capture import Capture, CaptureSettings, Split, find_source, open_capture, say_left_out
+from lang3dxl_ns.scene.colmap import Reconstruction, TrackedPhoto
 from lang3dxl_ns.scene.frame import Center, Frame, Orientation
-from lang3dxl_ns.scene.photo import Photo
 from lang3dxl_ns.scene.record import SCENE_FILE, SceneRecord
 from lang3dxl_ns.scene.transforms import TRANSFORMS
 
@@ -69,10 +70,12 @@ class CaptureOutputs(DataparserOutputs):
     frame: Frame | None = None
 
     @classmethod
-    def of(
-        cls, photos: list[Photo], poses: Tensor, side: float, frame: Frame, **seeds: Tensor
-    ) -> CaptureOutputs:
-        """Describe photos in a cube from -`side` to `side`, with the points to start from."""
+    def of(cls, capture: Capture, split: str, side: float, **seeds: Tensor) -> CaptureOutputs:
+        """Describe a split in a cube from -`side` to `side`, with the points to start from."""
+        names = capture.split.train if split == "train" else capture.split.held_out
+        known, frame = {photo.name: photo for photo in capture.photos}, capture.recorded_frame
+        photos = [known[name] for name in names]
+        poses = torch.from_numpy(capture.poses(names))
         return cls(
             image_filenames=[photo.path for photo in photos],
             cameras=to_nerfstudio([photo.lens for photo in photos], poses),
@@ -98,20 +101,16 @@ class PhotoCollectionDataParser(DataParser):
 
     def _generate_dataparser_outputs(self, split: str = "train", **kwargs) -> DataparserOutputs:
         capture = self.capture
-        names = capture.split.train if split == "train" else capture.split.held_out
-        known = {photo.name: photo for photo in capture.photos}
-        photos, poses = [known[name] for name in names], torch.from_numpy(capture.poses(names))
-        if split == "train" and (held_out := len(capture.photos) - len(photos)):
+        if split == "train" and (held_out := len(capture.photos) - len(capture.split.train)):
             say(
                 f"{held_out} of {len(capture.photos)} photos are held out of training, for evaluation "
                 "(`lang3dxl-colmap --eval-mode all` after all other options trains on all)"
             )
         points, colors = map(torch.from_numpy, capture.seeds)
+        # Without points in a transforms.json, which is allowed, training starts from random ones.
         seeds = {"points3D_xyz": points, "points3D_rgb": colors}
-        if capture.transforms is not None and not len(points):  # allowed: training starts from random ones
-            seeds = {}
-        side = self.config.scene_scale
-        return CaptureOutputs.of(photos, poses, side, capture.recorded_frame, **seeds)
+        seeds = seeds if capture.transforms is None or len(points) else {}
+        return CaptureOutputs.of(capture, split, self.config.scene_scale, **seeds)
 
     @cached_property
     def capture(self) -> Capture:
@@ -147,15 +146,28 @@ class RecordedSceneDataParser(DataParser):
     config: RecordedSceneDataParserConfig
 
     def _generate_dataparser_outputs(self, split: str = "train", **kwargs) -> DataparserOutputs:
-        scene = SceneRecord.read(self.config.run / SCENE_FILE)
-        chosen = [photo for photo in scene.photos if (photo.split == "train") == (split == "train")]
-        chosen = chosen or scene.photos  # with --eval-mode all, no photo is held out
-        photos = [photo.photo(Path(scene.data)) for photo in chosen]
-        poses = torch.tensor([photo.camera_to_world for photo in chosen], dtype=torch.float32)
-        frame = Frame(np.array(scene.transform, np.float64), scene.scale)
         # The checkpoint brings its own Gaussians, so start with as few as possible.
         few, colors = torch.eye(4)[:, :3], torch.zeros(4, 3)
-        return CaptureOutputs.of(photos, poses, 1.0, frame, points3D_xyz=few, points3D_rgb=colors)
+        return CaptureOutputs.of(self.capture, split, 1.0, points3D_xyz=few, points3D_rgb=colors)
+
+    @cached_property
+    def capture(self) -> Capture:
+        """The recorded photos and cameras, without points."""
+        scene = SceneRecord.read(self.config.run / SCENE_FILE)
+        frame, nothing = Frame(np.array(scene.transform, np.float64), scene.scale), np.zeros((0, 3))
+        world = frame.inverse().poses(np.array([photo.camera_to_world for photo in scene.photos]))
+        views = [view_matrix(pose)[:3].numpy() for pose in torch.from_numpy(world)]
+        photos = [photo.photo(Path(scene.data)) for photo in scene.photos]
+        tracked = {
+            photo.name: TrackedPhoto(photo.name, photo.lens, view, nothing, nothing[:, :2])
+            for photo, view in zip(photos, views, strict=True)
+        }
+        model = Reconstruction(tracked, nothing, nothing.astype(np.uint8))
+        train, held_out = (
+            tuple(photo.name for photo in scene.photos if photo.split == part) for part in ("train", "eval")
+        )
+        split = Split(train, held_out or train)  # with --eval-mode all, no photo is held out
+        return Capture(Path(scene.data), photos, model, known_split=split, known_frame=frame)
 
 
 def recorded_scene(run: Path | None) -> RecordedSceneDataParserConfig | None:
@@ -168,15 +180,20 @@ def recorded_scene(run: Path | None) -> RecordedSceneDataParserConfig | None:
 # ── the choice for --data ─────────────────────────────────────────────────────────────────────────────────
 
 
-def parser_for(config: DataParserConfig, cache_dir: Path | None, may_reconstruct: bool) -> DataParserConfig:
+def parser_for(
+    config: DataParserConfig, cache_dir: Path | None, may_reconstruct: bool
+) -> PhotoCollectionDataParserConfig:
     """Choose the dataparser for `config.data`, and note in it which model it found, so that a resumed run
     finds the same. Photos without a model are reconstructed, if allowed; a video becomes a folder of frames.
-    Scenes of nerfstudio's own transforms.json are read here as well; other dataparsers stay as they are.
-    Raises UserError if the photos don't make a scene."""
+    Scenes of nerfstudio's own transforms.json are read here as well. Raises UserError if the photos don't
+    make a scene, and for nerfstudio's other dataparsers."""
     if isinstance(config, NerfstudioDataParserConfig):
         config = _of_nerfstudio(config)
     if not isinstance(config, PhotoCollectionDataParserConfig):
-        return config
+        raise UserError(
+            f"{type(config).__name__} is not read here: leave the dataparser's name off, so that the COLMAP "
+            "model or transforms.json of the folder is found, or make one with ns-process-data"
+        )
     settings = config.capture_settings()
     folder, source = find_source(config.data, settings, cache_dir, may_reconstruct)
     if source.suffix == ".json":
@@ -189,13 +206,23 @@ def parser_for(config: DataParserConfig, cache_dir: Path | None, may_reconstruct
 
 
 def _of_nerfstudio(config: NerfstudioDataParserConfig) -> PhotoCollectionDataParserConfig:
-    """Return the settings by which this package reads the same scene in the same frame and split."""
+    """Return the settings by which this package reads the same scene in the same frame. Every eighth photo is
+    held out instead of a tenth. Raises UserError for choices that this package doesn't have."""
+    offered = {"eval_mode": ("fraction", "interval", "all")}
+    offered |= {"orientation_method": get_args(Orientation), "center_method": get_args(Center)}
+    for name, known in offered.items():
+        if (choice := getattr(config, name)) not in known:
+            option = f"--{name.replace('_', '-')}"
+            raise UserError(f"{option} {choice} is not known here: choose one of {', '.join(known)}")
     data = expanded(config.data)
     data = data if data.suffix == ".json" else data / TRANSFORMS
     if not data.exists():
         raise UserError(f"there is no {data}: give its folder as --data, or the file itself")
     shared = {f.name for f in fields(PhotoCollectionDataParserConfig)} & {f.name for f in fields(config)}
-    values = {name: getattr(config, name) for name in shared - {"_target", "data", "downscale_factor"}}
+    values: dict[str, Any] = {
+        name: getattr(config, name) for name in shared - {"_target", "data", "downscale_factor"}
+    }
+    values["eval_mode"] = "all" if config.eval_mode == "all" else "interval"
     return PhotoCollectionDataParserConfig(data=data, **values)
 
 

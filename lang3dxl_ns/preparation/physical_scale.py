@@ -43,11 +43,6 @@ class ScaleRange:
     reason: str
 
 
-def points_in_view(points: Float[Array, "m 3"], photo: TrackedPhoto) -> Float[Array, "k 3"]:
-    """Select the points in front of the camera that project into the (undistorted) photo, occluded or not."""
-    return _track_all_in_view(points, photo).points
-
-
 def pixel_size(
     photo: TrackedPhoto, distance: DistanceRule = "median", angle: AngleRule = "half"
 ) -> float | None:

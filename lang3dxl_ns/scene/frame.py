@@ -40,6 +40,11 @@ class Frame:
         turned = self.transform[:, :3] @ poses[:, :, :3]
         return np.concatenate([turned, self.points(poses[:, :, 3])[..., None]], axis=2)
 
+    def inverse(self) -> Frame:
+        """Return the similarity back."""
+        turn = np.linalg.inv(self.transform[:, :3])
+        return Frame(np.column_stack([turn, -self.scale * turn @ self.transform[:, 3]]), 1 / self.scale)
+
     def after(self, rotation: Float[Array, "3 4"], scale: float) -> Frame:
         """Return the frame for coordinates to which another similarity of this form was applied first."""
         turn, shift = self.transform[:, :3] @ rotation[:, :3], self.transform[:, :3] @ rotation[:, 3]

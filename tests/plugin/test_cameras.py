@@ -2,11 +2,9 @@
 
 import pytest
 import torch
-from nerfstudio.cameras.cameras import Cameras
 from scenes import view_of
 
-from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.plugin.cameras import lens_of, photo_camera, to_nerfstudio
+from lang3dxl_ns.plugin.cameras import photo_camera, to_nerfstudio
 from lang3dxl_ns.scene.camera import Camera, Lens, view_matrix
 
 LENS = Lens(width=64, height=48, fx=50.0, fy=57.0, cx=30.0, cy=26.0)
@@ -18,12 +16,6 @@ def pose():
     rotation = torch.linalg.qr(torch.randn(3, 3, generator=generator))[0]
     rotation = rotation * torch.linalg.det(rotation)
     return torch.cat([rotation, torch.tensor([[1.0], [2.0], [3.0]])], dim=1)
-
-
-def test_a_lens_survives_the_round_trip_through_nerfstudio(pose):
-    cameras = to_nerfstudio([LENS, LENS.resized(32, 24)], torch.stack([pose, pose]))
-    assert lens_of(cameras, 0) == LENS
-    assert lens_of(cameras, 1) == LENS.resized(32, 24)
 
 
 def test_nerfstudios_rays_and_the_rasterizers_pixels_agree(pose):
@@ -45,10 +37,3 @@ def test_a_camera_of_ours_is_the_same_one_in_nerfstudio(pose):
     torch.testing.assert_close(back.view_matrix, camera.view_matrix)
     torch.testing.assert_close(back.intrinsics, camera.intrinsics)
     assert (back.width, back.height) == (64, 48)
-
-
-def test_a_coefficient_that_the_lens_does_not_have_is_refused():
-    pose, distortion = torch.eye(4)[None, :3], torch.tensor([[0.1, 0, 0, 0.3, 0, 0.0]])
-    cameras = Cameras(pose, 100.0, 100.0, 50.0, 40.0, 100, 80, distortion_params=distortion)
-    with pytest.raises(UserError, match=r"k4 = 0\.3"):
-        lens_of(cameras, 0)

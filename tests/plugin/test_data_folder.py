@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from PIL import Image
 from scenes import speckled, write_scene
@@ -106,22 +107,32 @@ def write_transforms(data, count=12):
     return data
 
 
-def test_a_folder_with_transforms_is_read_in_nerfstudios_frame_and_split(tmp_path):
+def test_a_folder_with_transforms_is_read_in_nerfstudios_frame_and_splits_by_our_rule(tmp_path):
     """Runs that began with nerfstudio's own reader go on with the same cameras."""
     data = write_transforms(tmp_path / "data")
     theirs = NerfstudioDataParserConfig(data=data)
     ours = parser_for(NerfstudioDataParserConfig(data=data), None, True)
     assert isinstance(ours, PhotoCollectionDataParserConfig)
-    for split in ("train", "val"):
-        a, b = (parser.setup().get_dataparser_outputs(split) for parser in (theirs, ours))
-        assert [path.name for path in a.image_filenames] == [path.name for path in b.image_filenames]
-        torch.testing.assert_close(
-            a.cameras.camera_to_worlds, b.cameras.camera_to_worlds, atol=1e-5, rtol=1e-5
-        )
-        torch.testing.assert_close(a.dataparser_transform, b.dataparser_transform, atol=1e-5, rtol=1e-5)
-        assert a.dataparser_scale == pytest.approx(b.dataparser_scale)
+    poses = []
+    for parser in (theirs, ours):
+        outputs = [parser.setup().get_dataparser_outputs(split) for split in ("train", "val")]
+        names = [path.name for part in outputs for path in part.image_filenames]
+        placed = torch.cat([part.cameras.camera_to_worlds for part in outputs])
+        poses.append(dict(sorted(zip(names, placed, strict=True))))
+    torch.testing.assert_close(*poses, atol=1e-5, rtol=1e-5)
+    assert [path.name for path in outputs[1].image_filenames] == [*poses[1]][::8]
+    for choice in ({"eval_mode": "filename"}, {"orientation_method": "pca"}, {"center_method": "focus"}):
+        with pytest.raises(UserError, match="is not known here: choose one of"):
+            parser_for(NerfstudioDataParserConfig(data=data, **choice), None, True)
     manager = datamanager(data)
     assert len(manager.train_dataset) + len(manager.eval_dataset) == 12
+
+
+def test_nerfstudios_other_readers_are_refused_with_the_way_out(tmp_path):
+    with pytest.raises(
+        UserError, match="BlenderDataParserConfig is not read here: leave the dataparser's name"
+    ):
+        parser_for(BlenderDataParserConfig(data=write_transforms(tmp_path / "data")), None, True)
 
 
 def make_video(photos, path):

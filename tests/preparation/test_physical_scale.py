@@ -14,7 +14,6 @@ from lang3dxl_ns.preparation.physical_scale import (
     physical_scales,
     pixel_size,
     pixel_sizes,
-    points_in_view,
     propose_scale_range,
     relative_scales,
 )
@@ -175,12 +174,6 @@ def test_a_photo_without_usable_points_has_no_pixel_size(points, distance):
 def test_extreme_focal_lengths_give_finite_sizes(focal, angle):
     size = pixel_size(make_photo(focal=focal), angle=angle)
     assert 0 < size < np.inf
-
-
-def test_points_in_view_are_in_front_and_inside():
-    inside, beside, behind, at_camera = (1, 1, 10), (20, 0, 10), (1, 1, -10), (0, 0, 0)
-    seen = points_in_view(np.array([inside, beside, behind, at_camera], dtype=float), make_photo())
-    assert seen.tolist() == [list(inside)]
 
 
 def test_photos_without_tracks_fall_back_to_the_view_and_then_to_the_scene():

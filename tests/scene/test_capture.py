@@ -499,6 +499,11 @@ def test_a_frame_after_another_is_both():
     np.testing.assert_allclose(frame.after(given, 3.0).points(points), frame.points(applied))
 
 
+def test_the_inverse_of_a_frame_leads_back():
+    frame, poses = Frame(random_poses(1)[0], 0.7), random_poses(5, 1)
+    np.testing.assert_allclose(frame.inverse().poses(frame.poses(poses)), poses, atol=1e-12)
+
+
 @pytest.mark.parametrize("times", [500, 20_000, 1e6])
 @pytest.mark.parametrize("lost", [1, 2])
 def test_lost_cameras_are_told_and_change_nothing(times, lost):
