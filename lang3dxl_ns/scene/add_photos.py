@@ -153,7 +153,7 @@ def _targets(folder: Path, images: Path, known: set[str]) -> dict[str, str]:
         target = path.relative_to(images).as_posix() if within else f"{folder.name}/{name}"
         if target in known:
             continue
-        if not within and (images / target).exists() and not filecmp.cmp(path, images / target, False):
+        if not within and inside(images, target).exists() and not filecmp.cmp(path, images / target, False):
             raise UserError(f"{images / target} is another photo: rename the folder {folder}")
         targets[os.path.relpath(path, images)] = target
     if not targets:
