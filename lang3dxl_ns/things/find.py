@@ -30,6 +30,8 @@ SAMPLED = 50_000
 PAIRED, NEIGHBORS = 1_000, 3.0
 """Number of Gaussians, about, whose directions from each other tell where walls run, and their largest
 distance, relative to the gap between groups."""
+HEIGHTS = 0.01, 0.9995
+"""Shares of a landmark's Gaussians that lie below the ground, and below its top."""
 _KNOWN: WeakKeyDictionary[Answering, list[Thing]] = WeakKeyDictionary()
 """Things that were found in each scene so far: they keep their ids."""
 SURE = 0.6
@@ -116,6 +118,16 @@ def up_of(scene: Answering) -> Float[Array, "3"]:
     up = np.array([photo.camera_to_world for photo in scene.photos])[:, :, 1].mean(0)
     up = up if told is None else np.asarray(told.up, dtype=np.float64)
     return up / max(np.linalg.norm(up), 1e-9)
+
+
+def heights_of(scene: Answering) -> Float[Array, "2"]:
+    """Measure how high the ground and the landmark's top lie along `up_of`, world units, by what photos show
+    within twice the distance from the middle that three quarters of it have."""
+    places = scene.splats.means[scene.splats.sound() & (scene.mass > 0)].double().cpu().numpy()
+    if not len(places):
+        return np.array([0.0, 1.0])
+    apart = np.linalg.norm(places - np.median(places, axis=0), axis=1)
+    return np.quantile(places[apart <= 2 * np.quantile(apart, 0.75)] @ up_of(scene), HEIGHTS)
 
 
 def axes_of(scene: Answering) -> Float[Array, "3 3"]:

@@ -26,7 +26,7 @@ from lang3dxl_ns.query.match import as_bytes, save_picture
 from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.rendering import Rendering
 from lang3dxl_ns.scene.camera import in_camera_frame
-from lang3dxl_ns.things.find import Things, up_of
+from lang3dxl_ns.things.find import Things, heights_of, up_of
 from lang3dxl_ns.things.grammar import Sight, holds, sight_of
 from lang3dxl_ns.things.thing import Thing
 
@@ -48,8 +48,12 @@ def write_catalog(scene: Scene, answers: Sequence[Things], folder: Path) -> None
     place = scene.file.georeference
     meters = [None if place is None else (place.meters * t.size).round(2).tolist() for t in things]
     listed = [t.as_json() | {"meters": size} for t, size in zip(things, meters, strict=True)]
-    content = {"words": words, "things": listed, "relations": graph, "up": up_of(scene).tolist()}
-    content["unit"] = None if place is None else asdict(place)
+    (ground, top), up = heights_of(scene).tolist(), up_of(scene)
+    unit = 1 / max(top - ground, 1e-9) if place is None else place.meters
+    for thing, told in zip(things, listed, strict=True):
+        told["above_ground"] = round(unit * (float(thing.center @ up) - ground), 3)
+    content = {"words": words, "things": listed, "relations": graph, "heights": [ground, top]}
+    content |= {"up": up.tolist(), "unit": None if place is None else asdict(place)}
     write_atomically(folder / "things.json", json.dumps(content, indent=1) + "\n")
     rows = io.StringIO()
     table = csv.writer(rows, lineterminator="\n")

@@ -24,18 +24,12 @@ export function explain({ count, detail, known, live, words, foreground }) {
   return `${(detail?.count ?? count).toLocaleString("en")} Gaussians. ${live ? "Ask for anything." : `Ask for any of ${known.length.toLocaleString("en")} words.`}${within}`;
 }
 
-/** Return how many Gaussians of the scene so many of chunk 0 stand for. about: the page's description. */
-export const wholeCount = (number, { count, detail }) => (detail ? Math.round((number * detail.count) / count) : number);
-
-/** Tell how many Gaussians match: nearly, where the scene has detail, which isn't counted. */
-export const matched = (number, { detail }) =>
-  detail ? `About ${number.toLocaleString("en", { maximumSignificantDigits: 2 })} Gaussians match.` : `${number.toLocaleString("en")} Gaussians match.`;
-
-function doubtIn({ text, examples, open, taught, trust }) {
+function doubtIn({ text, examples, open, taught, trust, matching }) {
   const count = examples && `${examples.length} example${examples.length > 1 ? "s" : ""}`;
   if (examples) return open ? `${count}: click for more, with Alt or “Not this” for what it is not.` : `${count}.`;
   const remedy = trust.far ? "Outline it, or train with a larger CLIP (lang3dxl view or teach; docs: encoders)." : "Outline it, or click one and take Like this.";
-  return [...advice(text).map(sentence), `${sentence(trust.level)} ${sentence(trust.reason)}`, ...(trust.level === "sure" || taught ? [] : [remedy])].join(" ");
+  const nothing = matching || trust.level === "doubtful" ? [] : ["Nothing fits above the threshold."];
+  return [...advice(text).map(sentence), `${sentence(trust.level)} ${sentence(trust.reason)}`, ...nothing, ...(trust.level === "sure" || taught ? [] : [remedy])].join(" ");
 }
 
 const sentence = (text) => `${text[0].toUpperCase()}${text.slice(1)}.`;
@@ -55,9 +49,9 @@ function cardOf(prompt, rename) {
 }
 
 /** Bring a prompt's card up to date, and return it. acts: { fly, remove, rename, dragThreshold, setThreshold, teach,
- * outline, save, forget }, each called with the prompt; about: the page's description. */
-export function promptCard(prompt, { fly, remove, rename, dragThreshold, setThreshold, teach, outline, save, forget }, about) {
-  const { text, color, threshold, peak, matching, views, examples, open } = prompt, card = (prompt.card ??= cardOf(prompt, rename));
+ * outline, save, forget }, each called with the prompt. */
+export function promptCard(prompt, { fly, remove, rename, dragThreshold, setThreshold, teach, outline, save, forget }) {
+  const { text, color, threshold, peak, views, examples, open } = prompt, card = (prompt.card ??= cardOf(prompt, rename));
   const [header] = card.children, [heading] = header.children, parts = [];
   card.style.setProperty("--color", `rgb(${color})`);
   if (examples && heading.defaultValue !== text) heading.value = heading.defaultValue = text;
@@ -78,7 +72,7 @@ export function promptCard(prompt, { fly, remove, rename, dragThreshold, setThre
     const ends = [threshold, peak].map((value) => element("span", {}, value.toFixed(2)));
     if (peak > threshold) parts.push(element("div", { className: "ends" }, ends[0], element("div", { className: "heat" }), ends[1]));
     parts.push(
-      element("p", {}, `${doubtIn(prompt)} `, element("span", { className: "count" }, matched(matching, about))),
+      element("p", {}, doubtIn(prompt)),
       element("label", {}, "Threshold", slider)); // prettier-ignore
   }
   follow(header, ...parts);

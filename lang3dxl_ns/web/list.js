@@ -2,7 +2,7 @@
 import { element, shown, small } from "./cards.js";
 import { answerTo, count, parse, unsure, wordsOf } from "./grammar.js";
 import { Vector3 } from "./library.js";
-import { lengthAsText } from "./measure.js";
+import { heightAsText, inShares, lengthAsText } from "./measure.js";
 
 const NAMESPACE = "http://www.w3.org/2000/svg", CORNERS = [0, 1, 2, 3, 4, 5, 6, 7];
 const FILLED = 0.35, NARROW = 15, WIDE = 60; // share of the window that a thing fills after a flight; degrees of the lens
@@ -39,7 +39,8 @@ export class List extends EventTarget {
   part(prompt) {
     if (!prompt.found) return null;
     const { things } = prompt.found;
-    const summary = element("summary", {}, things.length ? count(prompt.found, this.about.detail ? " found in the coarse scene" : " found") : "No single things found");
+    if (!things.length) return element("p", {}, "No single things found.");
+    const summary = element("summary", {}, count(prompt.found, this.about.detail ? " found in the coarse scene" : " found"));
     const made = element("details", { className: "things", open: Boolean(prompt.listed) }, summary);
     summary.addEventListener("click", (event) => {
       event.preventDefault();
@@ -47,14 +48,14 @@ export class List extends EventTarget {
       if (!prompt.listed && this.chosen?.prompt === prompt) this.leave();
       this.dispatchEvent(new Event("change"));
     });
-    if (!prompt.listed || !things.length) return made;
+    if (!prompt.listed) return made;
     const own = this.chosen?.prompt === prompt, listed = element("ol", { ariaLabel: `Things: ${shown(prompt.text)}` });
     things.forEach((thing, k) => {
-      const ask = { ariaLabel: `${shown(prompt.text)} ${k + 1}`, ariaPressed: String(own && this.chosen.thing === thing) };
+      const ask = { ariaLabel: `${shown(prompt.text)} ${k + 1}`, ariaPressed: String(own && this.chosen.thing === thing), tabIndex: (own ? this.chosen.thing === thing : k === 0) ? 0 : -1 }; // one stop of the tabulator
       listed.append(element("li", { className: prompt.asked?.has(thing.id) ? "asked" : "" }, small(`${k + 1}`, () => this.choose(prompt, thing), ask)));
     });
     const [wide, deep, high] = own ? this.chosen.thing.size.map((side) => lengthAsText(side, this.about)) : [];
-    made.append(element("p", { className: "size" }, own ? `${high} high, ${wide} × ${deep} on the ground.` : ""), element("div", {}, small("‹", () => this.step(-1, prompt), { ariaLabel: "Previous thing" }), small("›", () => this.step(1, prompt), { ariaLabel: "Next thing" }),
+    made.append(element("p", { className: "size" }, own ? `${high} high, ${wide} × ${deep} wide and deep, its middle ${heightAsText(this.chosen.thing.center, this.about)}${inShares(this.about)}.` : ""), element("div", {}, small("‹", () => this.step(-1, prompt), { ariaLabel: "Previous thing" }), small("›", () => this.step(1, prompt), { ariaLabel: "Next thing" }),
       small("Hide the rest", () => this.hideRest(!this.alone), { ariaPressed: String(own && this.alone), disabled: !own })), listed); // prettier-ignore
     return made;
   }
@@ -160,7 +161,7 @@ export class List extends EventTarget {
     if (chosen.length) this.choose(first, chosen[0]);
     else this.dispatchEvent(new Event("change"));
     const numbers = chosen.map((thing) => things[request.word].indexOf(thing) + 1).join(", ");
-    return (chosen.length ? `${shown(request.word)} ${numbers}.` : `No ${shown(request.word)} fit.`) + note;
+    return (chosen.length ? `${shown(request.word)} ${numbers}.` : `Found no such ${shown(request.word)}.`) + note;
   }
 
   /** Directions of the viewer: right, up and ahead. */

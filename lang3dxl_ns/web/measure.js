@@ -2,7 +2,7 @@
 import { dot } from "./answer.js";
 import { $ } from "./cards.js";
 
-const WIDEST = 120, ROUND = [5, 2, 1]; // pixels of the scale bar; first digits of its length
+const WIDEST = 120, ROUND = [5, 2, 1], NEAR = 0.03; // pixels of the scale bar; first digits of its length; share of a landmark's height that is the ground
 const length = (vector) => Math.hypot(...vector);
 const between = ([a, b]) => b.map((value, axis) => value - a[axis]);
 
@@ -10,20 +10,28 @@ const between = ([a, b]) => b.map((value, axis) => value - a[axis]);
  * about: the page's description; its `unit` is what `setLength` found. */
 const metersOf = ({ unit, meters }) => (unit ? { meters: unit, uncertainty: null } : meters);
 
-/** Write a length of the scene's frame. */
+/** Write a length: in meters, or else as a share of the landmark's height, which `inShares` tells. */
 export function lengthAsText(units, about) {
-  const known = metersOf(about);
-  if (!known) return `${units.toPrecision(3)} units`;
+  const known = metersOf(about), [ground, top] = about.heights;
+  if (!known) return `${Number(((100 * units) / (top - ground)).toPrecision(2))} %`;
   const size = units * known.meters, digits = Number(size.toPrecision(3));
   return size >= 1 ? `${digits} m` : `${Number((100 * size).toPrecision(3))} cm`;
 }
 
+export const inShares = (about) => (metersOf(about) ? "" : " (shares of the landmark's height)");
+
+/** Tell how high a point lies above the ground. */
+export function heightAsText(point, about) {
+  const [ground, top] = about.heights, rise = dot(about.up, point) - ground;
+  return rise < NEAR * (top - ground) ? "on the ground" : `${lengthAsText(rise, about)} above the ground`;
+}
+
 /** Tell how far two points are apart, and how much higher one is. */
 export function distanceAsText(ends, about) {
-  const apart = between(ends), known = metersOf(about), rise = Math.abs(dot(apart, about.meters?.up ?? about.up));
+  const apart = between(ends), known = metersOf(about), rise = Math.abs(dot(apart, about.up));
   const gps = known?.uncertainty && ` (± ${Math.round(100 * known.uncertainty)} %, by the photos' GPS)`;
-  const sure = known ? gps || ", by the length that was typed" : "; the photos tell no meters, but you can type the length";
-  return `${lengthAsText(length(apart), about)} apart, ${lengthAsText(rise, about)} of it in height${sure}.`;
+  const sure = known ? gps || ", by the length that was typed" : `${inShares(about)}; the photos tell no meters, but you can type the length`;
+  return `${lengthAsText(length(apart), about)} apart, one ${lengthAsText(rise, about)} higher${sure}.`;
 }
 
 /** Set the scale of the page by two points and the meters between them. Without meters, it is the photos' again. */

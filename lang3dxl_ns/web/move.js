@@ -1,5 +1,6 @@
 // The eye: orbiting and walking by mouse, touch and keys, flights, and the space where it may be.
 import { OrbitControls, PerspectiveCamera, Vector3 } from "./library.js";
+import { isFree } from "./space.js";
 
 const FLIGHT = 1200, WIDEST = 110, ROOM = 8; // milliseconds, degrees of a lens, pixels between a landmark and buttons
 const TURN = 0.1, TAP = 0.1, PACE = 0.25; // radians and seconds of a key press; share of the overview's depth walked in a second
@@ -60,8 +61,13 @@ export class Mover extends EventTarget {
   }
 
   set address(text) {
+    this.goTo(text);
+  }
+
+  /** Go to a viewpoint that is written as `address` is, at once or in a flight. */
+  goTo(text = "", flying = false) {
     const stand = standOf(text);
-    if (stand) this.jump(stand);
+    if (stand) flying ? this.fly(stand) : this.jump(stand);
   }
 
   /** Stand somewhere at once, without a flight. */
@@ -106,21 +112,11 @@ export class Mover extends EventTarget {
 
   // ── flights ──
 
+  /** Fly to a viewpoint, around its target rather than through it. */
   fly(stand) {
     this.dispatchEvent(new Event("far"));
     this.flight = { from: this.stand, to: stand, start: performance.now() };
     this.wake();
-  }
-
-  /** Fly to a photo's viewpoint, around the target rather than through it. */
-  flyTo(photo, target) {
-    this.fly(this.standing(photo, target));
-  }
-
-  /** Fly to a viewpoint that is written as `address` is. */
-  flyToAddress(text) {
-    const stand = standOf(text);
-    if (stand) this.fly(stand);
   }
 
   overview() {
@@ -150,11 +146,8 @@ export class Mover extends EventTarget {
   // ── limits ──
 
   /** Whether photos show that a point is free: near where they were taken, and not within walls. */
-  open({ x, y, z }) {
-    if (!this.space) return false;
-    const { low, step, sides, bits } = this.space, place = [x, y, z].map((value, axis) => Math.floor((value - low[axis]) / step));
-    if (place.some((value, axis) => value < 0 || value >= sides[axis])) return false;
-    return bits[place[0] + sides[0] * (place[1] + sides[1] * place[2])] === 1;
+  open(point) {
+    return isFree(this.space, point.toArray().map((value, axis) => value - this.about.center[axis]));
   }
 
   /** Return how far the eye comes: to its aim, along one of the axes only, or nowhere. Whoever stands outside of the

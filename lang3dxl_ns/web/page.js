@@ -1,21 +1,21 @@
 // The page: the search box and its prompts, answers to clicks, words that are taught, and the keys.
-import { $, element, explain, matched, percent, promptCard, say, shown, small, wholeCount } from "./cards.js";
+import { $, element, explain, percent, promptCard, say, shown, small } from "./cards.js";
 import { Detail } from "./detail.js";
 import { isQuestion } from "./grammar.js";
 import { Kept, readFields, Steps, written, MOST_PROMPTS } from "./history.js";
 import { unpacked } from "./library.js";
 import { List } from "./list.js";
-import { distanceAsText, drawScale, setLength } from "./measure.js";
+import { distanceAsText, drawScale, heightAsText, inShares, setLength } from "./measure.js";
 import { Photos } from "./photos.js";
 import { areExamples, asPython, drawOutline, examplesAsText, examplesFromText, inside, rounded, UNNAMED, wordsFile } from "./teach.js";
-import { thinker } from "./think.js";
+import { fetched, thinker } from "./think.js";
 import { Tour } from "./tour.js";
 import { parsePrompts, tidy } from "./vocabulary.js";
 import { View } from "./view.js";
 
 const MOST_TRIED = 6, TIE = 0.02, HALF = "50"; // suggested words; relevancies that tell words apart; how many floaters a page hides at first
 const prompts = [], taughtHere = new Set(); // names that were taught to the server's scene from here
-let about, view, photos, list, tour, steps, kept, latest = null, settled = false, cleared = 0; // settled: the address has been read; cleared: how often all prompts were removed
+let about, view, photos, list, tour, steps, kept, settled = false, cleared = 0; // settled: the address has been read; cleared: how often all prompts were removed
 let ends = [], outlining = null, chosenLook = "";
 
 const think = thinker(
@@ -35,13 +35,16 @@ const words = () => [...new Set([...ownNames(), ...about.suggested, ...about.kno
 /** Describe a prompt for the worker. */
 const question = ({ text, negatives, examples, inScene }) => ({ text, negatives, examples: inScene ? null : examples });
 
+/** Return how many Gaussians of the scene so many of chunk 0 stand for. */
+const wholeCount = (number) => Math.round((number * (about.detail?.count ?? about.count)) / about.count);
+
 /** Answer a prompt anew. */
 async function answer(prompt) {
   const turn = (prompt.turn = {}); // a later answer to the same prompt wins
   if (prompt.examples && !prompt.examples.length) return Object.assign(prompt, { known: true, relevancy: null, threshold: null });
   const found = await think("ask", { ...question(prompt), threshold: prompt.chosen });
   if (turn !== prompt.turn || !found.known) return found;
-  return Object.assign(prompt, found, { matching: wholeCount(found.matching, about), views: null, finding: null });
+  return Object.assign(prompt, found, { matching: wholeCount(found.matching), views: null, finding: null });
 }
 
 /** Find the views that show prompts best, once their heat is drawn. */
@@ -142,7 +145,7 @@ function draw(newest = null) {
   const acts = { fly, remove, rename, dragThreshold, setThreshold, teach, outline, save, forget }, focused = document.activeElement;
   const from = focused.closest("#prompts > li"), label = focused.ariaLabel ?? focused.textContent, shownHere = $("prompts").children;
   list.tidy();
-  for (const prompt of prompts) promptCard(prompt, acts, about).append(list.part(prompt) ?? "");
+  for (const prompt of prompts) promptCard(prompt, acts).append(list.part(prompt) ?? "");
   for (const card of [...shownHere]) if (!prompts.some((prompt) => prompt.card === card)) card.remove();
   prompts.forEach(({ card }, k) => shownHere[k] === card || $("prompts").insertBefore(card, shownHere[k] ?? null));
   if (!focused.isConnected) [...(from?.querySelectorAll("button, input, summary") ?? [])].find((one) => (one.ariaLabel ?? one.textContent) === label)?.focus();
@@ -165,7 +168,7 @@ function fly(prompt) {
   const best = views[prompt.place];
   photos.hide();
   view.mover.walk(false);
-  view.mover.flyTo(about.views[best.index], best.target);
+  view.mover.fly(view.mover.standing(about.views[best.index], best.target));
   say(`View ${prompt.place + 1} of ${views.length}: ${best.name}; ${percent(best.area)} of it matches.`);
 }
 
@@ -184,13 +187,9 @@ function rename(prompt, name) {
   attempt(() => teachScene(prompt, before));
 }
 
-/** Follow a threshold that is being dragged: its heat and count, nothing else. */
+/** Follow a threshold that is being dragged: its heat, nothing else. */
 function dragThreshold(prompt, value) {
-  let count = 0;
-  for (const relevancy of prompt.relevancy) count += relevancy > value;
-  const matching = wholeCount(count, about);
-  Object.assign(prompt, { chosen: value, threshold: value, matching, dragged: true });
-  prompt.card.querySelector(".count").textContent = matched(matching, about);
+  Object.assign(prompt, { chosen: value, threshold: value, dragged: true });
   const end = prompt.card.querySelector(".ends span");
   if (end) end.textContent = value.toFixed(2);
   view.recolor(prompts.filter((one) => one.relevancy));
@@ -198,7 +197,7 @@ function dragThreshold(prompt, value) {
 
 function setThreshold(prompt, value) {
   dragThreshold(prompt, value);
-  Object.assign(prompt, { dragged: false, finding: null, views: null, turn: {} });
+  Object.assign(prompt, { dragged: false, finding: null, views: null, turn: {}, matching: wholeCount(prompt.relevancy.filter((one) => one > value).length) });
   quiet(); // what was told of the view counted the matches of before
   draw();
 }
@@ -207,9 +206,7 @@ function setThreshold(prompt, value) {
 
 async function whatIs(x, y, most = 5) {
   await reading;
-  if (!about.words) return [];
-  latest = await think("whatIs", { camera: view.picking, x, y, most });
-  return latest.words;
+  return about.words ? think("whatIs", { camera: view.picking, x, y, most }) : { words: [], rows: [] };
 }
 
 /** Mark an end of a distance; the second one tells it. */
@@ -234,7 +231,7 @@ async function tell({ x, y, without }) {
   if ($("measuring").checked) return measure(x, y);
   const teaching = prompts.find((prompt) => prompt.examples && prompt.open);
   if (teaching) return addMark(teaching, [[x, y]], without || teaching.without);
-  const words = await whatIs(x, y), { rows } = latest;
+  const { words, rows, point } = await whatIs(x, y);
   if (list.pick(rows)) return;
   const best = words[0]?.[1] ?? 0;
   const tied = words.filter(([, score]) => score > best - TIE), several = tied.length > 2;
@@ -242,7 +239,8 @@ async function tell({ x, y, without }) {
   quiet();
   const told = several ? "Here several words fit equally well, so none is sure:" : "Here, words that fit best:";
   $("here").replaceChildren(element("p", {}, words.length ? told : `Nothing is there${rows.length ? " that has a name" : ""}.`),
-    element("div", {}, ...buttons, ...(rows.length ? [small("Like this", () => attempt(() => likeThis([[x, y]])))] : []))); // prettier-ignore
+    element("div", {}, ...buttons, ...(rows.length ? [small("Like this", () => attempt(() => likeThis([[x, y]])))] : [])),
+    ...(point ? [element("p", {}, `It is ${heightAsText(point, about)}${inShares(about)}.`)] : [])); // prettier-ignore
   $("here").hidden = false;
 }
 
@@ -314,25 +312,19 @@ async function keepTour() {
   if (answered && !answered.ok) say(`The scene does not keep the tour: ${await answered.text()}`);
 }
 
-/** Teach a named word to the scene behind a live page, which answers it from then on. */
+/** Teach a named word to the scene behind a live page, which answers it from then on; its card says what became of it. */
 async function teachScene(prompt, before = prompt.text) {
-  const marks = about.live && prompt.named ? asPython(prompt.examples, about.cameras) : [];
-  if (!marks.length) {
-    if (prompt.named && !about.live) tellCard(prompt, "This browser keeps it. Save writes a file for lang3dxl words --load, which learns it from the photos.");
-    return;
+  if (!prompt.named) return;
+  const marks = asPython(prompt.examples, about.cameras), answered = about.live && marks.length ? await post("api/teach", { name: prompt.text, before, examples: marks }) : null;
+  if (!about.live) prompt.told = "This browser keeps it. Save writes a file for lang3dxl words --load, which learns it from the photos.";
+  else if (answered && !answered.ok) prompt.told = `The scene did not learn it: ${await answered.text()}`;
+  else if (answered) {
+    taughtHere.add(prompt.text);
+    await think("forget", { texts: [prompt.text, before] });
+    prompt.inScene = true;
+    await answer(prompt);
+    prompt.told = (await answered.json()).told;
   }
-  const answered = await post("api/teach", { name: prompt.text, before, examples: marks });
-  if (!answered.ok) return tellCard(prompt, `The scene did not learn it: ${await answered.text()}`);
-  taughtHere.add(prompt.text);
-  await think("forget", { texts: [prompt.text, before] });
-  prompt.inScene = true;
-  await answer(prompt);
-  prompt.told = (await answered.json()).told;
-  draw();
-}
-
-function tellCard(prompt, told) {
-  prompt.told = told;
   draw();
 }
 
@@ -391,8 +383,7 @@ async function apply(hash, turn = drop(), isStop = false) {
   outlining?.abort();
   photos.hide();
   if (!isStop) Object.assign(tour, { fields: wanted.stops }).stop();
-  if (isStop && wanted.view) view.mover.flyToAddress(wanted.view);
-  else if (wanted.view) view.mover.address = wanted.view;
+  view.mover.goTo(wanted.view, isStop);
   view.mover.walk(wanted.walk === "1");
   if (!isStop) about.unit = Number(wanted.unit) > 0 && Number.isFinite(Number(wanted.unit)) ? Number(wanted.unit) : null;
   $("cameras").ariaPressed = String(wanted.cameras === "1");
@@ -412,7 +403,7 @@ async function apply(hash, turn = drop(), isStop = false) {
     list.fields = wanted;
     for (const prompt of found) if (prompt.named) keepWord(prompt);
     for (const prompt of found) if (taughtHere.has(prompt.text) && !prompt.inScene) attempt(() => teachScene(prompt));
-    const photo = photos.named(wanted.photo);
+    const photo = photos.list.find(({ name }) => name === wanted.photo);
     if (photo?.photo && isStop) photos.coming = photo;
     else if (photo?.photo) photos.show(photo);
   } finally {
@@ -544,7 +535,7 @@ async function chooseLook(photo) {
 /** Show the scene in a photo's lighting. */
 async function light(photo) {
   $("look").value = photo;
-  const colors = photo ? new Uint8Array(await (await fetched(about.looks[photo])).arrayBuffer()) : view.root.own;
+  const colors = photo ? new Uint8Array(await (await fetched(about.looks[photo], about)).arrayBuffer()) : view.root.own;
   if ($("look").value === photo && view.root.plain !== colors) view.light(colors); // unless a later choice has been read in the meantime
 }
 
@@ -558,12 +549,6 @@ function hideFloaters() {
 
 // ── start ──
 
-async function fetched(name) {
-  const file = await fetch(about?.files?.[name] ?? name); // a written page's data have names by content
-  if (!file.ok) throw new Error(`${name} is missing (${file.status}): write the page again.`);
-  return file;
-}
-
 async function open() {
   about = await (await fetched("scene.json")).json();
   kept = new Kept(about);
@@ -572,7 +557,7 @@ async function open() {
   $("lighting").hidden = !Object.keys(about.looks).length;
   $("look").append(...Object.keys(about.looks).map((name) => element("option", { value: name }, name)));
   for (const control of [...$("ask").elements, $("teach")]) control.disabled = !about.words;
-  const splats = await (await fetched("splats.bin")).arrayBuffer();
+  const splats = await (await fetched("splats.bin", about)).arrayBuffer();
   await unpacked;
   view = new View(about, $("frame"));
   list = new List(about, think, view, prompts);
@@ -599,7 +584,7 @@ async function readMeaning(splats) {
 
 /** Read which Gaussians float, once the page answers. */
 async function readFloaters() {
-  view.root.floats = new Uint8Array(await (await fetched(about.floaters)).arrayBuffer());
+  view.root.floats = new Uint8Array(await (await fetched(about.floaters, about)).arrayBuffer());
   $("floating").hidden = false;
   hideFloaters();
 }
@@ -609,7 +594,7 @@ async function begin() {
   const turn = cleared;
   if (about.words) setTimeout(() => think("space").then((space) => (view.mover.space = space))); // behind the prompts
   setTimeout(() => attempt(readFloaters));
-  if (about.detail) new Detail(about, view, think, { read: fetched, question, failed: (error) => say(error.message) });
+  if (about.detail) new Detail(about, view, think, { read: (name) => fetched(name, about), question, failed: (error) => say(error.message) });
   const { stops, play } = readFields(location.hash);
   if (location.hash.length > 1) await apply(location.hash, turn);
   else for (const [text, ...negatives] of about.prompts) if (turn === cleared) await ask(asTyped({ text, negatives }), turn);
@@ -623,7 +608,7 @@ window.lang3dxl = {
   ready: reading.then(begin),
   ask: (typed) => ask(typed),
   clear,
-  whatIs,
+  whatIs: async (x, y, most) => (await whatIs(x, y, most)).words,
   prompts,
 };
 window.lang3dxl.ready.catch((error) => "told" in $("status").dataset || say(error.message)); // start.js may have said why

@@ -25,7 +25,7 @@ export class Photos {
 
   thumbnail(photo) {
     const picture = element("img", { src: photo.photo, alt: "", loading: "lazy", decoding: "async" });
-    const button = element("button", { ariaLabel: `Photo ${photo.name}`, title: photo.name, onclick: () => this.visit(photo) }, picture);
+    const button = element("button", { ariaLabel: `Photo ${photo.name}`, title: photo.name, onclick: () => this.visit(photo), tabIndex: this.buttons.size ? -1 : 0 }, picture); // one stop of the tabulator; keys lead on
     this.buttons.set(photo, button);
     return button;
   }
@@ -41,13 +41,9 @@ export class Photos {
     this.hide();
     this.at = this.list.indexOf(photo);
     this.view.mover.walk(false);
-    this.view.mover.flyTo(photo);
+    this.view.mover.fly(this.view.mover.standing(photo));
     this.coming = photo.photo ? photo : null;
     say(photo.doubtful ? `${photo.name}: its place is doubtful: ${photo.doubtful}.` : `Photo ${this.at + 1} of ${this.list.length}: ${photo.name}.`);
-  }
-
-  named(name) {
-    return this.list.find((photo) => photo.name === name);
   }
 
   /** Show the photo that was flown to once it is reached, and hide it when the eye leaves. */

@@ -2,7 +2,7 @@
 import { floats } from "./decode.js";
 import { seenAt } from "./space.js";
 
-const BLUR = 0.3; // square pixels added to every splat's variance, as in training
+export const BLUR = 0.3; // square pixels added to every splat's variance, as in training
 const MARGIN = 1.3; // half sizes of the picture beyond which a splat keeps its shape at this limit: see gaussians.py
 
 /** Unpack centers [3n] (relative to the scene's origin), axes [9n] scaled by standard deviations, opacities [n]. */
@@ -30,7 +30,7 @@ function rotation(axis, angle) {
 }
 
 /** Return the Gaussians that pixel x, y shows: [row, weight, center]. geometries: of the scene's parts, whose rows count
- * from `first` on; camera: { view: world → camera by columns, looking along −z; focal, width, height in pixels }. */
+ * from `first` on; camera: a view as of find.js, in their frame. */
 export function gaussiansAt(geometries, camera, x, y, antialiased) {
   const hits = geometries.flatMap((geometry) => hitsOf(geometry, camera, x, y, antialiased));
   let clear = 1;
@@ -42,36 +42,37 @@ export function gaussiansAt(geometries, camera, x, y, antialiased) {
 }
 
 /** List what a pixel shows of one part: [depth, row, opacity, center]. */
-function hitsOf({ centers, axes, opacities, first = 0 }, { view, focal, width, height }, x, y, antialiased) {
+function hitsOf({ centers, axes, opacities, first = 0 }, camera, x, y, antialiased) {
   const hits = [];
-  const [widest, highest] = [width, height].map((side) => (MARGIN * side) / 2 / focal);
-  const within = (slope, most) => Math.max(-most, Math.min(slope, most));
-  const turned = (a, b, c) => [0, 1, 2].map((k) => view[k] * a + view[4 + k] * b + view[8 + k] * c);
   for (let i = 0; i < opacities.length; i++) {
-    const [a, b, c] = [centers[3 * i], centers[3 * i + 1], centers[3 * i + 2]];
-    const depth = -(view[2] * a + view[6] * b + view[10] * c + view[14]);
+    const center = centers.subarray(3 * i, 3 * i + 3), place = seenAt(camera, center), depth = place[2];
     if (depth <= 0.01 || opacities[i] < 1 / 255) continue;
-    const right = (view[0] * a + view[4] * b + view[8] * c + view[12]) / depth;
-    const up = (view[1] * a + view[5] * b + view[9] * c + view[13]) / depth;
-    const du = x - width / 2 - focal * right, dv = y - height / 2 + focal * up;
+    const du = x - place[0], dv = y - place[1];
     let reach = 0;
     for (let k = 0; k < 9; k++) reach = Math.max(reach, Math.abs(axes[9 * i + k]));
-    if (Math.max(Math.abs(du), Math.abs(dv)) > 2 + (8 * focal * reach) / depth) continue;
-    let uu = 0, uv = 0, vv = 0;
-    const [sideways, upwards] = [within(right, widest), within(up, highest)];
-    for (let k = 9 * i; k < 9 * i + 9; k += 3) {
-      const [p, q, r] = turned(axes[k], axes[k + 1], axes[k + 2]);
-      const u = (focal * (p + sideways * r)) / depth, v = (-focal * (q + upwards * r)) / depth;
-      (uu += u * u), (uv += u * v), (vv += v * v);
-    }
+    if (Math.max(Math.abs(du), Math.abs(dv)) > 2 + (8 * camera.fx * reach) / depth) continue;
+    let [uu, uv, vv] = spreadAt(camera, axes, i, place);
     const sharp = uu * vv - uv * uv;
     uu += BLUR;
     vv += BLUR;
     const area = uu * vv - uv * uv, far = (vv * du * du - 2 * uv * du * dv + uu * dv * dv) / area;
     const alpha = opacities[i] * Math.exp(-far / 2) * (antialiased ? Math.sqrt(Math.max(sharp / area, 0)) : 1);
-    if (alpha > 1 / 255) hits.push([depth, first + i, Math.min(alpha, 0.999), [a, b, c]]);
+    if (alpha > 1 / 255) hits.push([depth, first + i, Math.min(alpha, 0.999), [...center]]);
   }
   return hits;
+}
+
+/** Compute the covariance of a Gaussian's ellipse around its place in a view, square pixels: uu, uv, vv. */
+export function spreadAt({ pose, fx, fy, cx, cy, width, height }, axes, i, [x, y, depth]) {
+  const within = (slope, most) => Math.max(-most, Math.min(slope, most));
+  const right = within((x - cx) / fx, (MARGIN * width) / 2 / fx), up = within((cy - y) / fy, (MARGIN * height) / 2 / fy);
+  let uu = 0, uv = 0, vv = 0;
+  for (let k = 9 * i; k < 9 * i + 9; k += 3) {
+    const turned = (column) => axes[k] * pose[0][column] + axes[k + 1] * pose[1][column] + axes[k + 2] * pose[2][column], back = turned(2);
+    const u = (fx * (turned(0) + right * back)) / depth, v = (-fy * (turned(1) + up * back)) / depth;
+    (uu += u * u), (uv += u * v), (vv += v * v);
+  }
+  return [uu, uv, vv];
 }
 
 /** Compute the place of what a pixel shows: the center of the Gaussian with which half of its weight is reached. */

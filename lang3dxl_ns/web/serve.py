@@ -105,6 +105,7 @@ class Handler(BaseHTTPRequestHandler):
 
     def do_POST(self) -> None:
         """Teach the scene a word, or keep a tour, for a page of this server that may be used."""
+        self.close_connection = True  # what is not read of the body is not another request
         self._answer(self._keep)
 
     def _keep(self) -> tuple[HTTPStatus, str, bytes]:
@@ -114,7 +115,6 @@ class Handler(BaseHTTPRequestHandler):
         page, path = self.server.page, urlsplit(self.path).path
         keep = {"/api/teach": page.teach, "/api/tour": page.keep_tour}.get(path)
         if keep is None or not ours or not 0 < size <= _MOST_MARKS:
-            self.close_connection = True  # what was sent is not read
             raise UserError("this server takes the marks of a word from its own page alone")
         try:
             content = json.loads(self.rfile.read(size))
@@ -125,7 +125,6 @@ class Handler(BaseHTTPRequestHandler):
     def _answer(self, answer: Callable[[], tuple[HTTPStatus, str, bytes]]) -> None:
         refused = self.server.access.refusal(self.path, self.headers)
         if refused is not None:
-            self.close_connection = self.close_connection or self.command == "POST"
             return self._send(*refused)
         try:
             status, kind, content = answer()

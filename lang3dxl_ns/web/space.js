@@ -1,31 +1,21 @@
 // The free space of a scene: where the eye may be, since photos look through it or were taken there.
 
-const CELLS = 20, SIDE = 44, MOST_VIEWS = 64; // cells along a view's longer side, of the space's longest axis; views used
+const CELLS = 20, MOST_VIEWS = 64; // cells along a view's longer side; views used
 const CLEAR = 0.95, FARTHEST = 1.5, NEAR = 0.12, HIDDEN = 0.2; // share of a depth that is free; of the median depth: farthest, and around a photo; share of a cell's pixels that lie before its surface
 
-/** Find the free space as { low, step, sides, bits }: cells of `step` units from `low` on, 1 where a photo was taken
- * nearby or some view sees farther. views, centers: as of find.js, in one frame. */
+/** Find what tells where the eye may be: { places of photos, reach around them, surfaces that views show }. views,
+ * centers: as of find.js, in one frame. */
 export function freeSpace(views, centers) {
   if (!views.length) return null;
-  const some = views.filter((_, k) => k % Math.ceil(views.length / MOST_VIEWS) === 0).map((view) => surfaceOf(view, centers));
-  const places = views.map(({ pose }) => [0, 1, 2].map((axis) => pose[axis][3]));
-  const median = sorted(some.map(({ median }) => median))[some.length >> 1], around = NEAR * median;
-  const ends = [0, 1, 2].map((axis) => {
-    const values = [...places.map((place) => place[axis]), ...some.flatMap(({ middle }) => [middle[axis] - 0.5 * median, middle[axis] + 0.5 * median])];
-    return [Math.min(...values) - around, Math.max(...values) + around];
-  });
-  const step = Math.max(...ends.map(([low, high]) => high - low)) / SIDE, low = ends.map(([first]) => first);
-  const sides = ends.map(([first, last]) => Math.max(Math.ceil((last - first) / step), 1)), bits = new Uint8Array(sides[0] * sides[1] * sides[2]);
-  const reach = Math.max(around, step) + step / 2, near = ([x, y, z]) => places.some(([a, b, c]) => (x - a) ** 2 + (y - b) ** 2 + (z - c) ** 2 < reach ** 2);
-  for (let i = 0; i < bits.length; i++) {
-    const cell = [i % sides[0], Math.floor(i / sides[0]) % sides[1], Math.floor(i / sides[0] / sides[1])];
-    const point = cell.map((value, axis) => low[axis] + (value + 0.5) * step);
-    bits[i] = near(point) || some.some((view) => looksThrough(view, point));
-  }
-  return { low, step, sides, bits };
+  const surfaces = views.filter((_, k) => k % Math.ceil(views.length / MOST_VIEWS) === 0).map((view) => surfaceOf(view, centers));
+  const median = Float32Array.from(surfaces, (surface) => surface.median).sort()[surfaces.length >> 1];
+  return { places: views.map(({ pose }) => pose.slice(0, 3).map((row) => row[3])), reach: NEAR * median, surfaces };
 }
 
-const sorted = (values) => Float32Array.from(values).sort();
+/** Return whether the eye may be at a point: near where a photo was taken, or before what some view shows. */
+export function isFree({ places, reach, surfaces }, [x, y, z]) {
+  return places.some(([a, b, c]) => Math.hypot(x - a, y - b, z - c) < reach) || surfaces.some((surface) => looksThrough(surface, [x, y, z]));
+}
 
 /** Project a point: pixel x, y, and depth. */
 export function seenAt({ pose, fx, fy, cx, cy }, [x, y, z]) {
@@ -36,7 +26,7 @@ export function seenAt({ pose, fx, fy, cx, cy }, [x, y, z]) {
 
 /** Measure the depth of what a view shows, by cells: where a fifth of a cell's pixels is nearer. */
 function surfaceOf(view, centers) {
-  const { rows, codes, sizes, width, height, pose } = view, size = Math.max(width, height) / CELLS;
+  const { rows, codes, sizes, width, height, pose, fx, fy, cx, cy } = view, size = Math.max(width, height) / CELLS;
   const across = Math.ceil(width / size), found = Array.from({ length: across * Math.ceil(height / size) }, () => []);
   const all = [];
   rows.forEach((row, k) => {
@@ -47,8 +37,7 @@ function surfaceOf(view, centers) {
   });
   const median = quantile(all, 0.5) || 1;
   const depths = Float32Array.from(found, (some) => Math.min(quantile(some, HIDDEN) || median, FARTHEST * median));
-  const middle = [0, 1, 2].map((axis) => pose[axis][3] - median * pose[axis][2]);
-  return { ...view, size, across, depths, median, middle };
+  return { pose, fx, fy, cx, cy, width, height, size, across, depths, median };
 }
 
 function quantile(pairs, share) {

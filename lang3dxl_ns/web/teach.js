@@ -2,31 +2,16 @@
 import { element } from "./cards.js";
 import { inFile } from "./photos.js";
 
-const MASK_SIDE = 1024, SAMPLES = 48, LONGEST = 6000; // pixels of a mask's longer side, pixels sampled in an outline, characters of a link
+const MASK_SIDE = 1024, GRID = 15, SAMPLES = 48, LONGEST = 6000; // pixels of a mask's longer side, a side of the grid around an outline, pixels sampled in it, characters of a link
 export const UNNAMED = /^like this (\d+)$/;
 
 /** Sample pixels evenly within an outline. */
 export function inside(outline) {
-  const ends = [0, 1].map((axis) => [Math.min(...outline.map((p) => p[axis])), Math.max(...outline.map((p) => p[axis]))]);
-  const [wide, high] = ends.map(([low, end]) => end - low), found = [];
-  const step = Math.sqrt(Math.max(areaOf(outline), 1e-3 * wide * high, 1e-9) / SAMPLES);
-  for (let y = step / 2; y < high; y += step)
-    for (let x = step / 2; x < wide; x += step) {
-      const point = [ends[0][0] + x, ends[1][0] + y];
-      if (contains(outline, point)) found.push(point);
-    }
-  return found.length ? found : [outline[0]];
-}
-
-const areaOf = (outline) => Math.abs(outline.reduce((sum, [x, y], k) => sum + x * outline[(k + 1) % outline.length][1] - y * outline[(k + 1) % outline.length][0], 0)) / 2;
-
-function contains(outline, [x, y]) {
-  let within = false;
-  outline.forEach(([ax, ay], k) => {
-    const [bx, by] = outline[(k + 1) % outline.length];
-    if (ay > y !== by > y && x < ((bx - ax) * (y - ay)) / (by - ay) + ax) within = !within;
-  });
-  return within;
+  const [left, right, top, bottom] = [0, 1].flatMap((axis) => [Math.min, Math.max].map((most) => most(...outline.map((place) => place[axis]))));
+  const pen = element("canvas").getContext("2d"), path = new Path2D(`M${outline.join("L")}Z`), ways = Array.from({ length: GRID }, (_, k) => (k + 0.5) / GRID);
+  const grid = ways.flatMap((y) => ways.map((x) => [left + x * (right - left), top + y * (bottom - top)]));
+  const found = grid.filter(([x, y]) => pen.isPointInPath(path, x, y, "evenodd")), step = Math.max(Math.ceil(found.length / SAMPLES), 1);
+  return found.length ? found.filter((_, k) => k % step === 0) : [outline[0]];
 }
 
 // ── marks in a link: rows, then the photo's number with places in it, in shares of its sides ──

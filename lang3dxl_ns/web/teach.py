@@ -8,7 +8,7 @@ from pathlib import Path
 from threading import Lock
 from typing import Any
 
-from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.errors import DAMAGE, UserError
 from lang3dxl_ns.common.files import locked
 from lang3dxl_ns.files.scene_file import describe_scene_file, keep_words
 from lang3dxl_ns.query.scene import Scene
@@ -35,7 +35,7 @@ class PageWords:
         try:
             name, before = str(content["name"]), str(content["before"])
             examples = [Example.from_json(example) for example in content["examples"]]
-        except (ValueError, LookupError, TypeError, AttributeError) as error:
+        except DAMAGE as error:
             raise UserError(f"these are no marks of a word ({error}): load the page again") from error
         with self._one:
             if self.file is None:
@@ -79,9 +79,8 @@ class PageWords:
             return scene
         left = [example for example in word.examples if _plain(example) not in ours]
         rest = [other for other in scene.words.values() if other is not word]
-        if left:
-            return scene.with_words(rest).teach(word.name, left)
-        return scene.with_words(rest)
+        scene = scene.with_words(rest)
+        return scene.teach(word.name, left) if left else scene
 
 
 def _plain(example: Example) -> dict[str, Any]:

@@ -2,10 +2,12 @@
 // Python renders the heat that is cut into pieces; here it is drawn from the pixels that each Gaussian fills.
 import language from "./language.js";
 import { fitted } from "./like.js";
+import { BLUR, spreadAt } from "./pick.js";
+import { seenAt } from "./space.js";
 
 const { LEVELS, PART, DEPTH, FILLED, SHARED, SPLINTER, VIEWS, CRUMB, OFTEN, OVER, OUTLIERS, COLORED, SAME, SLIM, STRAIGHT } = language.things;
 const SIDE = 240, LEAST = 3; // pixels of a view's longer side, and of the smallest piece
-const FAINT = 0.05, TRACE = 0.004, REACH = 2.5, BLUR = 0.3; // relevancy and heat that leave no trace, standard deviations that are drawn, square pixels
+const FAINT = 0.05, TRACE = 0.004, REACH = 2.5; // relevancy and heat that leave no trace, standard deviations that are drawn
 const RIDGE = 0.1, ROUNDS = 12; // strength of the colors' regularization, Newton steps
 const DC = 0.28209479177387814; // of spherical harmonics: colors are compared as coefficients
 
@@ -101,22 +103,14 @@ function neighborhood(centers, rows, distance) {
 /** Draw a view's heat and depth: what each Gaussian fills, spread over its footprint. */
 export function drawn(view, { centers, axes }, heat) {
   const scale = Math.min(1, SIDE / Math.max(view.width, view.height)), { rows, codes, sizes } = view;
-  const [fx, fy, cx, cy] = [view.fx, view.fy, view.cx, view.cy].map((value) => value * scale), turn = view.pose.slice(0, 3).flat();
-  const width = Math.round(view.width * scale), height = Math.round(view.height * scale), filled = width * height;
+  const [fx, fy, cx, cy] = [view.fx, view.fy, view.cx, view.cy].map((value) => value * scale);
+  const width = Math.round(view.width * scale), height = Math.round(view.height * scale), filled = width * height, small = { ...view, fx, fy, cx, cy, width, height };
   const map = new Float32Array(filled), depth = new Float32Array(filled), points = new Float32Array(3 * rows.length);
   for (let n = 0; n < rows.length; n++) {
-    const i = rows[n], p = centers[3 * i] - turn[3], q = centers[3 * i + 1] - turn[7], r = centers[3 * i + 2] - turn[11];
-    const z = -(p * turn[2] + q * turn[6] + r * turn[10]), right = (p * turn[0] + q * turn[4] + r * turn[8]) / z, up = (p * turn[1] + q * turn[5] + r * turn[9]) / z;
-    const x = cx + fx * right, y = cy - fy * up;
-    (points[3 * n] = x), (points[3 * n + 1] = y), (points[3 * n + 2] = sizes[codes[n]] * view.width * view.height < FILLED ? NaN : z); // NaN belongs to no piece
+    const i = rows[n], place = seenAt(small, centers.subarray(3 * i, 3 * i + 3)), [x, y, z] = place;
+    points.set([x, y, sizes[codes[n]] * view.width * view.height < FILLED ? NaN : z], 3 * n); // NaN belongs to no piece
     if (heat[i] <= FAINT || !(z > 0)) continue;
-    const sideways = Math.max(-1, Math.min(right, 1)), upwards = Math.max(-1, Math.min(up, 1));
-    let uu = BLUR, uv = 0, vv = BLUR; // covariance of its footprint, square pixels
-    for (let k = 9 * i; k < 9 * i + 9; k += 3) {
-      const a = axes[k], b = axes[k + 1], c = axes[k + 2], back = turn[2] * a + turn[6] * b + turn[10] * c;
-      const u = (fx * (turn[0] * a + turn[4] * b + turn[8] * c + sideways * back)) / z, v = (-fy * (turn[1] * a + turn[5] * b + turn[9] * c + upwards * back)) / z;
-      (uu += u * u), (uv += u * v), (vv += v * v);
-    }
+    const [a, uv, b] = spreadAt(small, axes, i, place), uu = a + BLUR, vv = b + BLUR;
     const area = uu * vv - uv * uv, most = (heat[i] * sizes[codes[n]] * filled) / (2 * Math.PI * Math.sqrt(area));
     const wide = REACH * Math.sqrt(uu), tall = REACH * Math.sqrt(vv);
     const first = Math.max(Math.ceil(x - wide - 0.5), 0), last = Math.min(Math.floor(x + wide - 0.5), width - 1), bottom = Math.min(Math.floor(y + tall - 0.5), height - 1);

@@ -1,5 +1,12 @@
 // The page's worker: jobs that think about the scene beside its drawing.
 
+/** Fetch a file of the page; a written page's data have names by content. */
+export async function fetched(name, about = null) {
+  const file = await fetch(about?.files?.[name] ?? name);
+  if (!file.ok) throw new Error(`${name} is missing (${file.status}): write the page again.`);
+  return file;
+}
+
 /** Start a worker; returns a function that gives it a job and resolves to the answer. told: called with the share of
  * the scene that has been read; failed: called if the worker can't run. */
 export function thinker(told, failed) {

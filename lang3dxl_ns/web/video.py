@@ -15,6 +15,7 @@ from jaxtyping import Float64
 from numpy import ndarray as Array
 from PIL import Image, ImageDraw, ImageFont
 
+from lang3dxl_ns.common.checks import expect
 from lang3dxl_ns.common.console import tracked
 from lang3dxl_ns.common.errors import UserError, readable
 from lang3dxl_ns.common.files import expanded
@@ -27,8 +28,9 @@ from lang3dxl_ns.things.find import up_of
 
 RATE, SIZE = 25, (1280, 720)
 """Pictures per second, and their width and height in pixels."""
-_FLIGHT, _PAUSE, _LETTER = 2.0, 3.0, 0.06
-"""Seconds of a flight, at a stop, and for each letter of its caption."""
+_FLIGHT, _PAUSE, _LETTER, _LONGEST = 2.0, 3.0, 0.06, 60.0
+"""Seconds of a flight, at a stop, for each letter of its caption, and at most at a stop."""
+_MOST_STOPS = 1000
 Shot = tuple[Camera, Sequence[Prompt], str, int]
 """A camera, the prompts whose heat is drawn, a caption, and the number of pictures that show it."""
 
@@ -39,12 +41,13 @@ def tour_shots(scene: Scene, tour: str, size: tuple[int, int] = SIZE) -> list[Sh
     shots, up = list[Shot](), up_of(scene)
     with readable("the scene's tour can't be read", "keep its views again in the page"):
         stops = [_stop(text) for name, text in parse_qsl(tour.removeprefix("#")) if name == "stop"]
+        expect(len(stops) <= _MOST_STOPS, f"it has {len(stops):,} stops")
         for (before, *_), (stand, prompts, caption) in zip([*stops[:1], *stops], stops, strict=False):
             times = np.linspace(0, 1, 1 + int(RATE * _FLIGHT))[1:] if shots else np.ones(1)
             for ease in times**2 * (3 - 2 * times):
                 camera = _camera(before + ease * (stand - before), up, size)
                 shots.append((camera, prompts, caption, 1))
-            shots[-1] = (*shots[-1][:3], int(RATE * (_PAUSE + _LETTER * len(caption))))
+            shots[-1] = (*shots[-1][:3], int(RATE * min(_PAUSE + _LETTER * len(caption), _LONGEST)))
     if not shots:
         raise UserError("there is no tour: keep views in the page of lang3dxl view, or give --camera-path")
     return shots

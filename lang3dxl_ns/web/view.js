@@ -198,13 +198,12 @@ export class View extends EventTarget {
     return [((seen.x + 1) / 2) * this.frame.clientWidth, ((1 - seen.y) / 2) * this.frame.clientHeight];
   }
 
-  /** The camera in the form that pick.js takes, in the frame of the packed splats. */
+  /** The camera as a view of find.js, in the frame of the packed splats. */
   get picking() {
-    const { clientWidth: width, clientHeight: height } = this.frame;
+    const { clientWidth: width, clientHeight: height } = this.frame, focal = height / 2 / Math.tan((this.camera.fov * Math.PI) / 360);
     this.camera.updateMatrixWorld();
-    const view = this.camera.matrixWorldInverse.clone(), [x, y, z] = this.about.center, m = view.elements;
-    for (let k = 0; k < 3; k++) m[12 + k] += m[k] * x + m[4 + k] * y + m[8 + k] * z;
-    return { view: [...m], focal: height / 2 / Math.tan((this.camera.fov * Math.PI) / 360), width, height };
+    const m = this.camera.matrixWorld.elements, pose = [0, 1, 2].map((row) => [m[row], m[4 + row], m[8 + row], m[12 + row] - this.about.center[row]]);
+    return { pose, fx: focal, fy: focal, cx: width / 2, cy: height / 2, width, height };
   }
 
   listen() {

@@ -5,6 +5,7 @@ import { massOf, rankViews, readViews } from "./find.js";
 import { likeness } from "./like.js";
 import { bestPhoto, gaussiansAt, middleOf, unpackSplats } from "./pick.js";
 import { freeSpace } from "./space.js";
+import { fetched } from "./think.js";
 import { isPresent, Known, thingsOf } from "./things.js";
 import { ancestry, FAN } from "./tree.js";
 import { Vocabulary } from "./vocabulary.js";
@@ -25,23 +26,6 @@ async function understood(phrases) {
 function judged([text, ...negatives], threshold) {
   const relevancy = answers.relevancy(text, negatives.map(({ own }) => own));
   return answers.verdict(relevancy, { strict: Boolean(negatives.length || text.taught), doubt: text.taught?.doubt, threshold, name: text.name });
-}
-
-/** Compute which Gaussians may match: 1 where any of these prompts does; null without prompts. */
-async function foregroundOf(prompts) {
-  if (!prompts.length) return null;
-  const mask = new Uint8Array(about.words.count);
-  for (const phrases of prompts) {
-    const { relevancy, threshold } = judged((await understood(phrases)).found);
-    relevancy.forEach((value, i) => (mask[i] ||= value > threshold));
-  }
-  return mask;
-}
-
-async function file(name) {
-  const answer = await fetch(about.files?.[name] ?? name);
-  if (!answer.ok) throw new Error(`${name} is missing (${answer.status})`);
-  return answer;
 }
 
 /** Read rows of codes, or rows that were decoded beforehand. */
@@ -81,13 +65,13 @@ const hitsAt = (camera, x, y) => gaussiansAt([...parts.values()].map(({ geometry
 
 /** Move a point into the world's frame. */
 const inWorld = (point) => point.map((value, axis) => value + about.center[axis]);
-const bytes = async (name) => (await file(name)).arrayBuffer();
+const bytes = async (name) => (await fetched(name, about)).arrayBuffer();
 
 const jobs = {
   async load({ description, splats }) {
     about = description;
     const { words } = about;
-    const [listed, numbers] = [await (await file("vocabulary.json")).json(), await bytes("vocabulary.bin")];
+    const [listed, numbers] = [await (await fetched("vocabulary.json", about)).json(), await bytes("vocabulary.bin")];
     vocabulary = new Vocabulary(listed, numbers, words.width, about.live);
     const tell = (done) => new Promise((go) => (postMessage({ done }), setTimeout(go)));
     field = words.field && (await bytes("field.bin"));
@@ -102,7 +86,7 @@ const jobs = {
     }));
     mass = massOf(views, words.count);
     known = new Known(mass);
-    answers.foreground = await foregroundOf(about.foreground);
+    answers.foreground = about.foreground.length ? new Uint8Array(await bytes("foreground.bin")) : null;
     return vocabulary.listed;
   },
 
@@ -163,7 +147,7 @@ const jobs = {
       covered += weight;
     }
     if (covered < about.words.covered) return { words: [], rows: [] };
-    return { words: answers.naming(blend, most), rows: [...new Set(hits.sort((a, b) => b[1] - a[1]).slice(0, EXAMPLE).map(([id]) => gaussian(id).root))] };
+    return { point: inWorld(middleOf(hits)), words: answers.naming(blend, most), rows: [...new Set(hits.sort((a, b) => b[1] - a[1]).slice(0, EXAMPLE).map(([id]) => gaussian(id).root))] };
   },
 
   /** Hide the Gaussians that float more than a limit, 0…255, from clicks. */
@@ -174,11 +158,8 @@ const jobs = {
     return {};
   },
 
-  /** Find the free space in the world's frame; null where no view tells. */
-  space() {
-    const space = freeSpace(views, geometry.centers);
-    return space && { ...space, low: inWorld(space.low) };
-  },
+  /** Find the free space, in the frame of the packed splats; null where no view tells. */
+  space: () => freeSpace(views, geometry.centers),
 
   /** Find the point of the world at a pixel; null where nothing is. */
   point({ camera, x, y }) {

@@ -72,7 +72,8 @@ _NUMBERS = (
 _TEXTS = 256
 """Number of texts encoded at a time."""
 _DATA = re.compile(
-    r"(splats|codes|field|rows|floaters|vocabulary|views|look\d+|photo\d+|part\d+)\.[0-9a-f]{12}\.(bin|json|jpg)"
+    r"(splats|codes|field|rows|floaters|foreground|vocabulary|views|(look|photo|part)\d+)\.[0-9a-f]{12}\."
+    r"(bin|json|jpg)"
 )
 """Names of a page's data files. Nothing else in its folder is ever deleted."""
 MOST_TEXT = 2_000
@@ -143,15 +144,14 @@ class Page:
             "background": [0, 0, 0] if scene.background is None else scene.background.tolist(),
             "up": find.up_of(scene).tolist(),
             "edges": find.axes_of(scene).tolist(),
+            "heights": find.heights_of(scene).tolist(),
             "tour": told.tour,
             "meters": None if scene.file.georeference is None else asdict(scene.file.georeference),
             "start": pack.camera_json(scene.overview.full_camera),
             "colors": PROMPT_COLORS,
             "live": self.live,
             "prompts": _phrases(self.prompts),
-            "words": None,
-            "names": [],
-            "suggested": [],
+            **{"words": None, "names": [], "suggested": []},
         }
         if self.levels is not None:
             files |= self._chunks(self.levels, center)
@@ -185,9 +185,11 @@ class Page:
                 for name in views
             ]
             about["foreground"] = _phrases(self._foreground)
+            if self._foreground:
+                within = scene.ask(self._foreground, foreground="").gaussians.any(0)
+                files["foreground.bin"] = _bytes(within / 255)
             named = _distinct([*(word.name for word in scene.words.values()), *self.words, *self.more])
-            several = filter(re.compile(r"[\s,]").search, named)
-            about["names"] = [name for name in several if phrases_of(name) != [(name, [])]]
+            about["names"] = [name for name in named if phrases_of(name) != [(name, [])]]
             about["suggested"] = self._suggested()
         about["left_out"] = self.left_out
         files["scene.json"] = json.dumps(about).encode()
@@ -245,7 +247,7 @@ class Page:
     def _vocabulary(self, meaning: pack.PackedMeaning) -> dict[str, bytes]:
         """Encode the words that the page knows: those that may name a place first, then all others."""
         negatives, taught = list(self.scene.text.config.negatives), self.scene.words
-        asked = [phrase for phrases in _phrases([*self.prompts, *self._foreground]) for phrase in phrases]
+        asked = [phrase for phrases in _phrases(self.prompts) for phrase in phrases]
         naming = _distinct([*shipped_vocabulary(), *self.words, *asked])
         others = [*(word.name for word in taught.values()), *common_words(), *ANCHORS, *self.more]
         words = _distinct([*naming, *others])
@@ -296,8 +298,7 @@ class Page:
         if not text:
             raise UserError("the prompt is empty: type what to look for, such as rose window")
         near, against = self._meant(self._meaning, text)
-        vector = self.scene.text.vectors([text]).to(self.scene.device)
-        own = self._meaning.of_texts(vector)[0].tolist()
+        own = next(self._encoded(self._meaning, [text]))[0].tolist()
         meant = closest_word(text, (*self.scene.words, *common_words()))
         told: dict[str, Any] = {"own": own, "near": near.tolist(), "against": against, "meant": meant}
         known = self.scene.words.get(known_word(text))
@@ -371,7 +372,8 @@ def write_page(page: Page, folder: Path) -> int:
     data = sorted(files.keys() - {*own, "scene.json"})
     # Data have names by content, which scene.json lists: a page whose writing is stopped, or whose files a
     # browser or a copy keeps from earlier, never shows the splats of one scene with the words of another.
-    named = {name: _by_content(name, files[name]) for name in data}
+    hashes = {name: hashlib.sha256(files[name]).hexdigest()[:12] for name in data}
+    named = {name: f"{Path(name).stem}.{short}{Path(name).suffix}" for name, short in hashes.items()}
     about = json.loads(files["scene.json"]) | {"files": named}
     for camera in about["cameras"]:
         camera["photo"] = named.get(camera["photo"], camera["photo"])
@@ -386,9 +388,3 @@ def write_page(page: Page, folder: Path) -> int:
         if ours and _DATA.fullmatch(path.name) and path.name not in named.values():
             path.unlink(missing_ok=True)
     return sum(map(len, files.values()))
-
-
-def _by_content(name: str, content: bytes) -> str:
-    """Return a file's name with a hash of its content: splats.0123456789ab.bin."""
-    stem, _, ending = name.rpartition(".")
-    return f"{stem}.{hashlib.sha256(content).hexdigest()[:12]}.{ending}"

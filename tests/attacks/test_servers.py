@@ -250,3 +250,37 @@ def test_the_body_of_a_get_is_no_second_request(page):
             raw.sendall(first.format(port=page.port).replace("\n", "\r\n").encode())
             answers = b"".join(iter(lambda: raw.recv(1 << 16), b""))
         assert answers.count(b"HTTP/1.1 ") == 1 and answers.startswith(b"HTTP/1.1 200")
+
+
+@pytest.mark.parametrize("point", ["1e999", "NaN", "9" * 400, "1e300"])
+def test_numbers_that_are_none_are_no_marks(page, point):
+    """Python's float and int raise an OverflowError for some, which is no ValueError."""
+    marks = (
+        f'"points": [[{point}, 1]]',
+        f'"points": [], "mask": {{"size": [{point}, 2], "counts": [1]}}',
+        f'"points": [], "box": [{point}, 0, 1, 1]',
+    )
+    for marked in marks:
+        example = f'{{"photo": "left/0001.jpg", "not_points": [], {marked}}}'
+        body = f'{{"name": "gate", "before": "", "examples": [{example}]}}'
+        assert posted(page, body, len(body)).startswith(b"HTTP/1.1 400"), marked
+
+
+@pytest.mark.parametrize("length", ["abc", "-5", "1e3", "0", "99999999999"])
+def test_what_is_not_read_of_a_post_is_not_another_request(page, length):
+    """Otherwise what one sends after it would pass for a request of the page's own."""
+    smuggled = f"GET / HTTP/1.1\r\nHost: localhost:{page.port}\r\nConnection: close\r\n\r\n"
+    assert b"HTTP/1.1 200" not in posted(page, smuggled, length)
+
+
+def posted(server, body: str, length: object) -> bytes:
+    """The answers to a POST from the server's own page, until it closes the connection."""
+    head = f"POST /api/teach HTTP/1.1\r\nHost: localhost:{server.port}\r\nContent-Length: {length}\r\n"
+    head += f"Origin: http://localhost:{server.port}\r\nContent-Type: application/json\r\n\r\n"
+    answers = b""
+    with socket.create_connection(("127.0.0.1", server.port), timeout=30) as raw:
+        raw.sendall((head + body).encode())
+        with contextlib.suppress(ConnectionError):  # it closes before it has read all
+            while part := raw.recv(1 << 16):
+                answers += part
+    return answers

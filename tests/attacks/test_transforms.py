@@ -77,6 +77,13 @@ def test_null_is_no_value(folder):
         open_capture(write(folder, top={"fl_x": None, "fl_y": None}, camera_angle_x=4.0))
 
 
+@pytest.mark.parametrize(("model", "key"), [("OPENCV", "k4"), ("OPENCV_FISHEYE", "p1")])
+def test_distortion_of_another_model_than_the_cameras_is_refused(folder, model, key):
+    open_capture(write(folder, camera_model=model, **{key: 0}))
+    with pytest.raises(UserError, match=f"a {model} camera with {key}, of another model"):
+        open_capture(write(folder, camera_model=model, **{key: 0.1}))
+
+
 @pytest.mark.parametrize("key", ["file_path", "mask_path"])
 @pytest.mark.parametrize("name", ["../secret.png", "/etc/hostname", "a\0b", "..", "images", "~/secret.png"])
 def test_names_that_lead_outside_or_nowhere_are_named_and_never_opened(folder, key, name):

@@ -101,12 +101,59 @@ def test_a_glb_that_keeps_an_spz_holds_what_the_spz_holds(tmp_path):
     [
         ({"extensions": {"KHR_gaussian_splatting_lgsc": {"bufferView": 0}}}, {}, "by KHR_.*_lgsc"),
         ({}, {"POSITION": 0, "_SCALE": 1}, "a draft"),
+        ({}, {"POSITION": 0, "KHR_gaussian_splatting:SCALE": 1, "COLOR_0": 2}, "of points"),
         ({"extensions": {"KHR_gaussian_splatting_compression_spz_2": {"bufferView": 0}}}, {}, "damaged"),
     ],
 )  # fmt: skip
 def test_what_a_glb_has_instead_of_known_splats_is_named(extension, attributes, told, tmp_path):
     glb_of(tmp_path / "a.glb", extension, attributes, b"\x1f\x8b")
     with pytest.raises(UserError, match=told):
+        read_splats(tmp_path / "a.glb")
+
+
+def changed(path, change) -> None:
+    """Write a GLB again, of which a function changes the description and the binary part."""
+    about, binary = described(path)
+    binary = change(about, about["meshes"][0]["primitives"], bytearray(binary)) or binary
+    text = json.dumps(about).encode()
+    parts = (text + b" " * (-len(text) % 4), b"JSON"), (binary, b"BIN\0")
+    body = b"".join(struct.pack("<I4s", len(part), kind) + part for part, kind in parts)
+    path.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(body)) + body)
+
+
+def test_a_glb_with_logarithms_for_scales_is_read(tmp_path):
+    """As splat-transform wrote it at first."""
+    splats = some_splats()
+
+    def logarithms(about, primitives, binary):
+        accessor = about["accessors"][primitives[0]["attributes"]["KHR_gaussian_splatting:SCALE"]]
+        start = about["bufferViews"][accessor["bufferView"]].get("byteOffset", 0)
+        binary[start : start + 12 * len(splats)] = splats.scales.log().numpy().tobytes()
+        return bytes(binary)
+
+    write_splats(tmp_path / "a.glb", splats)
+    changed(tmp_path / "a.glb", logarithms)
+    assert torch.allclose(read_splats(tmp_path / "a.glb").scales, splats.scales, rtol=1e-5)
+
+
+def test_a_glb_with_several_splats_tells_that_one_is_read(tmp_path, capsys):
+    write_splats(tmp_path / "a.glb", some_splats())
+    changed(tmp_path / "a.glb", lambda _, primitives, __: primitives.append(primitives[0]))
+    assert len(read_splats(tmp_path / "a.glb")) == 200
+    assert "holds 2 splats, of which the first is read" in capsys.readouterr().out
+
+
+def test_a_glb_may_name_the_stride_of_rows_without_gaps(tmp_path):
+    def stride(size):
+        return lambda about, primitives, _: about["bufferViews"][
+            about["accessors"][primitives[0]["attributes"]["POSITION"]]["bufferView"]
+        ].update(byteStride=size)
+
+    write_splats(tmp_path / "a.glb", splats := some_splats())
+    changed(tmp_path / "a.glb", stride(12))
+    assert torch.equal(read_splats(tmp_path / "a.glb").means, splats.means)
+    changed(tmp_path / "a.glb", stride(16))
+    with pytest.raises(UserError, match="interleaved"):
         read_splats(tmp_path / "a.glb")
 
 

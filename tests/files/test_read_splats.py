@@ -115,6 +115,39 @@ def test_plain_colors_are_bytes_or_fractions(tmp_path, most):
     assert_alike(read_splats(tmp_path / "b.ply"), splats, colors=1e-5)
 
 
+@pytest.mark.parametrize(("kind", "name", "most"), [("u1", "uchar", 255), ("<u2", "ushort", 65535)])
+def test_plain_colors_that_are_whole_numbers_are_never_fractions(tmp_path, kind, name, most):
+    """Also in a splat so dark that none is over 1."""
+    write_splats(tmp_path / "a.ply", some_splats(bands=1))
+    lines, rows = (tmp_path / "a.ply").read_bytes().split(b"end_header\n")[0], table(tmp_path / "a.ply")[1]
+    for colors in (np.ones((300, 3)), np.full((300, 3), most)):
+        kinds = [(n, kind if n[:5] == "f_dc_" else "<f4") for n in rows.dtype.names]
+        stored = rows.astype(kinds)
+        for i in range(3):
+            stored[f"f_dc_{i}"] = colors[:, i]
+            plain = ("red", "green", "blue")[i]
+            lines = lines.replace(b"float f_dc_%d" % i, b"%b %b" % (name.encode(), plain.encode()))
+        (tmp_path / "b.ply").write_bytes(lines + b"end_header\n" + stored.tobytes())
+        shown = read_splats(tmp_path / "b.ply").harmonics[:, 0] * 0.28209479 + 0.5
+        wanted = colors[0, 0] / (255 if colors[0, 0] <= 255 else most)
+        assert torch.allclose(shown, torch.tensor(wanted, dtype=torch.float32), atol=1e-3)
+
+
+def test_columns_may_have_capitals(tmp_path):
+    write_splats(tmp_path / "a.ply", splats := some_splats(bands=1))
+    head, body = (tmp_path / "a.ply").read_bytes().split(b"end_header\n", 1)
+    for name in table(tmp_path / "a.ply")[0]:
+        head = head.replace(b"float %b\n" % name.encode(), b"float %b\n" % name.upper().encode())
+    (tmp_path / "b.ply").write_bytes(head + b"end_header\n" + body)
+    assert_alike(read_splats(tmp_path / "b.ply"), splats)
+
+
+def test_an_spz_may_be_unpacked_already(tmp_path):
+    write_splats(tmp_path / "a.spz", some_splats())
+    (tmp_path / "b.spz").write_bytes(gzip.decompress((tmp_path / "a.spz").read_bytes()))
+    assert_alike(read_splats(tmp_path / "b.spz"), read_splats(tmp_path / "a.spz"))
+
+
 def test_two_dimensional_gaussians_are_thin(tmp_path):
     write_splats(tmp_path / "a.ply", some_splats())
     names, rows = table(tmp_path / "a.ply")

@@ -194,10 +194,22 @@ def test_an_empty_images_folder_does_not_hide_the_photos(walk, tmp_path):
 
 
 @needs_ffmpeg
+def test_a_videos_place_may_have_a_percent_sign(tmp_path):
+    """As in names that were copied from an address. ffmpeg takes one for the place of a number."""
+    (tmp_path / "My%20Videos 100%d").mkdir()
+    video = tmp_path / "My%20Videos 100%d" / "a%d.mkv"
+    graph = ["-f", "lavfi", "-i", "testsrc=size=64x48:rate=10:duration=1", "-c:v", "mjpeg"]
+    subprocess.run(["ffmpeg", "-v", "error", *graph, str(video)], check=True)
+    frames = extract_frames(video)
+    assert frames.parent == video.parent and len(list((frames / "images").iterdir())) == 2
+
+
+@needs_ffmpeg
 def test_what_is_no_video_is_an_error(tmp_path):
     (tmp_path / "a.mp4").write_bytes(b"no video")
-    with pytest.raises(UserError, match=r"a\.mp4 is not a video"):
+    with pytest.raises(UserError, match=r"a\.mp4 is not a video.*: copy it again, or convert it") as told:
         extract_frames(tmp_path / "a.mp4")
+    assert "\n" not in str(told.value)
 
 
 def test_a_video_without_ffmpeg_is_an_error_that_names_it(tmp_path, monkeypatch):

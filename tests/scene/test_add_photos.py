@@ -210,3 +210,13 @@ def test_without_a_model_the_way_to_one_is_told(scene):
     shutil.rmtree(scene / "data/sparse")
     with pytest.raises(UserError, match="reconstruct it first, without --add"):
         add_photos(scene / "data", scene / "late", None, SIFT)
+
+
+def test_new_photos_are_not_copied_through_a_link_that_came_with_the_scene(tmp_path):
+    """Who made the scene's folder would choose where they go."""
+    for name in ("scene", "late", "elsewhere"):
+        (tmp_path / name).mkdir()
+    Image.new("RGB", (8, 6)).save(tmp_path / "late" / "a.jpg")
+    (tmp_path / "scene" / "late").symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(UserError, match="leads out of"):
+        module._targets(tmp_path / "late", tmp_path / "scene", set())

@@ -226,11 +226,30 @@ def test_a_mask_with_the_ending_mask_is_found(folder):
     assert open_capture(folder).photos[0].mask_path.name == "photo_000.png.mask"
 
 
-def test_masks_that_no_photo_finds_are_told(folder, capsys):
+@pytest.mark.parametrize("name", ["other.png", "photo_000.npy"])
+def test_masks_that_no_photo_finds_are_told(folder, capsys, name):
     (folder / "masks").mkdir()
-    Image.new("L", (96, 72), 255).save(folder / "masks" / "other.png")
+    Image.new("L", (96, 72), 255).save(folder / "masks" / name, "PNG")
     open_capture(folder)
     assert "has no picture that is named like a photo" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("mode", ["RGBA", "LA", "P"])
+def test_what_is_transparent_in_a_photo_does_not_count(folder, capsys, mode):
+    """Cut-outs, as programs that remove backgrounds make them. An opaque fourth channel means nothing."""
+    cut, whole = (folder / "images" / f"photo_00{i}.png" for i in (0, 1))
+    alpha = Image.fromarray(np.repeat(np.uint8([[0] * 48 + [255] * 48]), 72, axis=0))
+    with Image.open(cut) as photo:
+        shown = photo.convert("RGBA")
+    shown.putalpha(alpha)
+    shown.convert(mode).save(cut)
+    with Image.open(whole) as photo:
+        photo.convert("RGBA").save(whole)
+    capture = open_capture(folder)
+    assert "1 photos have transparent parts, which do not count: photo_000.png" in capsys.readouterr().out
+    assert capture.photos[1].mask_path is None
+    mask = capture.photos[0].read_mask()
+    assert mask[:, 48:].all() and not mask[:, :48].any()
 
 
 def palette(colors):
@@ -252,6 +271,10 @@ def palette(colors):
         palette([(0, 0, 0), (1, 1, 1)]),
         palette([(0, 0, 0), (128, 0, 0)]),
         palette([(0, 0, 0), (64, 0, 0)]),
+        Image.fromarray(np.array([[[0, 0]] * 2 + [[255, 255]] * 2], np.uint8), "LA"),
+        Image.fromarray(np.array([[[0, 0]] * 2 + [[0, 255]] * 2], np.uint8), "LA"),
+        Image.fromarray(np.array([[[90, 80, 70, 0]] * 2 + [[90, 180, 70, 255]] * 2], np.uint8)),
+        Image.fromarray(np.array([[[0, 0, 0, 255]] * 2 + [[255] * 4] * 2], np.uint8)),
     ],
 )
 def test_masks_of_every_kind_keep_their_right_half(tmp_path, image):

@@ -1,5 +1,6 @@
 """Meters, up and north from GPS positions of photos."""
 
+import json
 import math
 
 import numpy as np
@@ -115,6 +116,11 @@ def test_a_record_keeps_meters_and_forgets_places(tmp_path):
         (tmp_path / "scene.json").write_text(text.replace(*wrong))
         with pytest.raises(UserError, match="can't be read"):
             SceneRecord.read(tmp_path / "scene.json")
+    content = json.loads(text)
+    content["georeference"]["north"] = content["georeference"]["up"]
+    (tmp_path / "scene.json").write_text(json.dumps(content))
+    with pytest.raises(UserError, match="its north points up"):
+        SceneRecord.read(tmp_path / "scene.json")
 
 
 def test_meters_hold_across_the_date_line():

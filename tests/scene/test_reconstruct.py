@@ -19,7 +19,7 @@ from lang3dxl_ns.scene.reconstruct import reconstruct, reconstruct_scene
 from lang3dxl_ns.scene.reconstruction import ReconstructionSettings
 from lang3dxl_ns.scene.symmetry import contradictions
 
-SIFT = ReconstructionSettings(features="sift")  # also where XFeat is installed
+SIFT = ReconstructionSettings()
 
 
 @pytest.fixture(scope="module")
@@ -70,6 +70,28 @@ def test_poses_are_those_that_the_photos_were_taken_from(reconstructed):
     assert distances.max() < 0.15  # of about 4 to the box
 
 
+def test_stronger_features_find_them_too(photos, scene, monkeypatch):
+    extract, match, strong = pycolmap.extract_features, pycolmap.match_image_pairs, []
+
+    def extracts(*files, extraction_options):
+        sift = extraction_options.sift
+        strong.extend([sift.estimate_affine_shape, sift.domain_size_pooling])
+        extract(*files, extraction_options=extraction_options)
+
+    def matches(database, options, pairing):
+        strong.append(options.guided_matching)
+        match(database, options, pairing)
+
+    monkeypatch.setattr(pycolmap, "extract_features", extracts)
+    monkeypatch.setattr(pycolmap, "match_image_pairs", matches)
+    _, model = reconstruct_scene(photos, None, ReconstructionSettings(features="dsp-sift"))
+    assert strong == [True] * 3
+    degrees, distances = pose_errors(model, scene / "given" / "0")
+    assert len(degrees) == 7
+    assert degrees.max() < 2.5
+    assert distances.max() < 0.15
+
+
 def test_what_matches_measure_agrees_with_the_model(reconstructed):
     """Else an honest model would be doubted; and a photo that is turned in it is."""
     data, model, _ = reconstructed
@@ -85,7 +107,10 @@ def test_what_matches_measure_agrees_with_the_model(reconstructed):
     }
 
 
-def test_contradicting_pairs_are_left_out_of_a_second_model(photos, monkeypatch, capsys):
+@pytest.mark.parametrize(("kind", "points"), [("xfeat", [15, 30]), ("sift", [15])])
+def test_contradicting_pairs_of_learned_matches_are_left_out_of_a_second_model(
+    photos, monkeypatch, capsys, kind, points
+):
     """The pair is honest here, so all photos keep a pose by others. The database keeps it. More
     points have to agree in the second model."""
     asked, mapping = [], pycolmap.incremental_mapping
@@ -94,11 +119,15 @@ def test_contradicting_pairs_are_left_out_of_a_second_model(photos, monkeypatch,
         asked.append(files[-1].mapper.abs_pose_min_num_inliers)
         return mapping(*files, **more)
 
+    for step in (module.extract, module.match):  # without the learned networks
+        monkeypatch.setattr(module, step.__name__, lambda *files, step=step: step(*files[:-1], SIFT))
     monkeypatch.setattr(pycolmap, "incremental_mapping", watched)
     monkeypatch.setattr(module, "contradictions", lambda pairs: {(1, 7)})
-    report = reconstruct(find_photos(photos), photos / "work", photos / "sparse", SIFT)
-    assert "mapping anew without them" in capsys.readouterr().out
-    assert (report.registered, report.contradicting, asked) == (7, 1, [15, 30])
+    settings = ReconstructionSettings(features=kind)
+    report = reconstruct(find_photos(photos), photos / "work", photos / "sparse", settings)
+    again = len(points) - 1
+    assert ("mapping anew without them" in capsys.readouterr().out) == again
+    assert (report.registered, report.contradicting, asked) == (7, again, points)
     assert not list((photos / "work").glob("tmp*"))
 
 
@@ -122,6 +151,12 @@ def test_a_picture_shows_the_cameras_and_is_no_photo(reconstructed):
 def test_all_photos_share_the_camera(reconstructed):
     _, model, _ = reconstructed
     assert pycolmap.Reconstruction(model).num_cameras() == 1
+
+
+def test_learned_features_without_their_package_are_an_error(photos, monkeypatch):
+    monkeypatch.setattr(module, "find_spec", lambda name: None)
+    with pytest.raises(UserError, match=r"pip install -e '\.\[match\]'"):
+        reconstruct_scene(photos, None, ReconstructionSettings(features="xfeat"))
 
 
 def test_a_second_reconstruction_in_one_folder_ends_at_once(photos):

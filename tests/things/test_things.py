@@ -17,7 +17,7 @@ from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.query.trust import FAR
 from lang3dxl_ns.rendering import Camera, Rendering
 from lang3dxl_ns.scene.georeference import Georeference
-from lang3dxl_ns.things.find import Things, axes_of, up_of
+from lang3dxl_ns.things.find import Things, axes_of, heights_of, up_of
 from lang3dxl_ns.things.grammar import Request, Sight, answer, parse, sight_of, table, unsure
 from lang3dxl_ns.things.join import OFTEN, Joined, grown, join, stacked, without_crumbs
 from lang3dxl_ns.things.pieces import Piece, Shown, pieces_of, split
@@ -291,9 +291,24 @@ def test_the_catalog_has_meters_where_the_scene_has_them(known, tmp_path):
     catalog = json.loads((tmp_path / "things.json").read_text())
     assert catalog["things"][0]["meters"] == ([2.5, 5.0, 10.0] if known else None)
     assert (catalog["unit"] or {}).get("meters") == (2.5 if known else None)
+    ground, top = catalog["heights"]
+    above = (np.dot(catalog["up"], one.center) - ground) * (2.5 if known else 1 / (top - ground))
+    assert catalog["things"][0]["above_ground"] == pytest.approx(above, abs=1e-3)
     with (tmp_path / "things.csv").open() as file:
         (row,) = csv.DictReader(file)
     assert [row["height"], row["height_m"]] == ["4.0", "10.0" if known else ""]
+
+
+def test_strays_do_not_move_the_ground():
+    scene = painted_scene()
+    ground, top = heights_of(scene)
+    heights = scene.splats.means.double().numpy() @ up_of(scene)
+    assert ground == pytest.approx(heights.min(), abs=0.1) and top == pytest.approx(heights.max(), abs=0.1)
+    means = scene.splats.means.clone()
+    means[:100] *= 100
+    moved = painted_scene(splats=replace(scene.splats, means=means))
+    vars(moved)["mass"] = scene.mass  # photos show them
+    np.testing.assert_allclose(heights_of(moved), (ground, top), atol=0.02 * (top - ground))
 
 
 def test_generated_questions_are_right_where_all_is_found_and_tell_what_is_missed():

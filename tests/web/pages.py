@@ -106,10 +106,9 @@ def tilted_scene():
 
 def camera_of_page(place, center):
     """A camera as the page's worker takes it, with the splats' origin at the center."""
-    pose = torch.tensor(place["pose"], dtype=torch.float64)
-    pose[:3, 3] -= torch.tensor(center, dtype=torch.float64)
-    view = torch.linalg.inv(pose).T.flatten().tolist()
-    return {"view": view, "focal": place["fx"], "width": place["width"], "height": place["height"]}
+    pose = np.array(place["pose"])
+    pose[:3, 3] -= center
+    return {**place, "pose": pose.tolist()}
 
 
 @contextmanager

@@ -172,12 +172,11 @@ def test_the_picture_is_sharp_while_detail_arrives_and_numbers_are_of_the_whole(
     with served(tmp_path) as address:
         tab = opened(browser, address, DESK)
         found = tab.evaluate("lang3dxl.ready.then(() => lang3dxl.ask('dome'))")
-        card = tab.evaluate("lang3dxl.prompts[0].card.querySelector('.count').textContent")
         tab.evaluate(HELD)
         assert tab.evaluate(ARRIVING)
         tab.close()
     exact = int(scene.ask("dome").gaussians[0].sum())
-    assert abs(found["matching"] / exact - 1) < 0.2 and card.startswith("About ")
+    assert abs(found["matching"] / exact - 1) < 0.2
 
 
 def test_a_lighting_reaches_the_details(browser, tmp_path):

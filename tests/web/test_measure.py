@@ -8,6 +8,7 @@ from pages import DESK, browser, opened, served, until_linked, until_told
 from painted_scene import painted_file, painted_scene
 
 from lang3dxl_ns.scene.georeference import Georeference
+from lang3dxl_ns.things.find import heights_of, up_of
 from lang3dxl_ns.web.write_page import Page, write_page
 
 CLICK = """async ([x, y]) => {
@@ -29,10 +30,37 @@ def test_two_clicks_tell_a_distance_in_meters_and_its_height(browser, tmp_path):
             assert tab.evaluate(CLICK, [-0.6, -0.4]) == "Click the other end."
             told = tab.evaluate(CLICK, [0.6, 0.5])
             tab.close()
-        apart, rise = map(float, re.match(r"([\d.]+) \S+ apart, ([\d.]+) ", told).groups())
-        scale = 20 if known else 1
+        apart, rise = map(float, re.match(r"([\d.]+) \S+ apart, one ([\d.]+) ", told).groups())
+        scale = 20 if known else 100 / np.ptp(heights_of(painted_scene()))
         assert abs(apart - 1.5 * scale) < 0.15 * scale and abs(rise - 0.9 * scale) < 0.15 * scale
-        assert ("± 3 %" in told) == (known is not None) == ("units" not in told)
+        assert ("± 3 %" in told) == (known is not None) == ("landmark's height" not in told)
+
+
+HERE = """async ([x, y]) => {
+  const [column, row] = lang3dxl.view.pixel([x, y, 0]), here = document.getElementById("here");
+  here.hidden = true;
+  lang3dxl.view.dispatchEvent(new CustomEvent("click", { detail: { x: column, y: row } }));
+  while (here.hidden) await new Promise((go) => setTimeout(go, 50));
+  return here.textContent;
+}"""
+
+
+def test_a_click_tells_its_height_above_the_ground(browser, tmp_path):
+    meters = Georeference(20.0, (0.0, 1.0, 0.0), (1.0, 0.0, 0.0), 0.03, 5)
+    for name, known in (("gps", meters), ("none", None)):
+        scene = painted_scene(file=replace(painted_file(), georeference=known))
+        write_page(Page(scene), tmp_path / name)
+        (ground, top), up = heights_of(scene), up_of(scene)
+        unit = 20 if known else 100 / (top - ground)
+        with served(tmp_path / name) as address:
+            tab = opened(browser, address, DESK)
+            for height in (0.5, 1.5):
+                told = tab.evaluate(HERE, [0.6, height])
+                number = float(re.search(r"It is ([\d.]+) (m|%) above the ground", told)[1])
+                assert abs(number - unit * (up @ [0.6, height, 0] - ground)) < 0.1 * unit
+            low = (ground + 0.01 - 0.6 * up[0]) / up[1]
+            assert "It is on the ground" in tab.evaluate(HERE, [0.6, low])
+            tab.close()
 
 
 SCALE = """() => {
@@ -60,7 +88,8 @@ def test_a_typed_length_sets_the_scale_and_travels_in_the_link(browser, tmp_path
         tab.evaluate("document.getElementById('more').open = true")
         tab.evaluate("document.getElementById('measuring').click()")
         tab.evaluate(CLICK, [-0.6, -0.4])
-        units = float(tab.evaluate(CLICK, [0.6, 0.5]).split()[0])
+        shares = float(tab.evaluate(CLICK, [0.6, 0.5]).split()[0])
+        units = shares / 100 * np.ptp(heights_of(painted_scene()))
         tab.fill("#length", "30,0")
         tab.press("#length", "Enter")
         until_told(tab, "#status", "30 m apart")

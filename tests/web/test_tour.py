@@ -164,6 +164,10 @@ def test_a_video_says_what_it_lacks(tmp_path, monkeypatch):
             tour_shots(scene, bad)
     with pytest.raises(UserError, match="no tour"):
         tour_shots(scene, "")
+    with pytest.raises(UserError, match="1,001 stops"):
+        tour_shots(scene, "&".join(["stop=view%3D1%2C-3%2C0.5%2C0%2C0%2C0%2C50"] * 1001))
+    long = "stop=caption%3D" + "x" * 100_000 + "%26view%3D1%2C-3%2C0.5%2C0%2C0%2C0%2C50"
+    assert tour_shots(scene, long)[0][3] == 60 * 25  # a minute
     monkeypatch.setenv("PATH", "")
     with pytest.raises(UserError, match="needs ffmpeg"):
         write_video(tmp_path / "a.mp4", scene, shots[:1])

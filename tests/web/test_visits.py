@@ -156,6 +156,18 @@ def test_a_visit_by_touch_alone(browser, address):
         tap("Hide photo")
         until(page, "document.getElementById('over').hidden")
         assert page.evaluate("document.documentElement.scrollWidth") <= PHONE["width"]
+        page.locator("#more summary").tap()
+        page.get_by_text(
+            "Measure between two clicks"
+        ).tap()  # far down the panel, which still tells what to do
+        until(page, "document.getElementById('panel').scrollTop > 50")
+        told = "document.getElementById('status').getBoundingClientRect().top - "
+        told += "document.getElementById('panel').getBoundingClientRect().top"
+        until(
+            page,
+            f"{told} >= 0 && document.getElementById('status').textContent",
+            "Click one end of what you measure.",
+        )
 
 
 @pytest.mark.slow
