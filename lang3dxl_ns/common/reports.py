@@ -62,10 +62,10 @@ def host_peak() -> int:
 
 @contextmanager
 def timed(seconds: dict[str, float], name: str) -> Iterator[None]:
-    """Keep how long the enclosed block takes in `seconds`, under its name."""
+    """Add how long the enclosed block takes to `seconds`, under its name."""
     start = time.perf_counter()
     yield
-    seconds[name] = time.perf_counter() - start
+    seconds[name] = seconds.get(name, 0.0) + time.perf_counter() - start
 
 
 def markdown_table(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:

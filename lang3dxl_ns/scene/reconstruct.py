@@ -13,7 +13,7 @@ import shutil
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, replace
 from importlib.util import find_spec
 from io import BytesIO
 from pathlib import Path
@@ -73,6 +73,9 @@ _STAMP = "photos.json"
 _POINTS, _POINTS_OF_TWINS = 15, 30
 """Fewest points that agree on a photo's pose, and fewest where sides look alike, as COLMAP's mapper has it: a
 quarter more photos of a hall get one, but 15 points also agree on the wrong side."""
+_ENOUGH, _MOST_STRONG = 0.9, 100
+"""Share of photos with a pose from which plain features suffice, and most photos for stronger ones: half an
+hour of two cores."""
 _RELAXED = {"init_min_num_inliers": 30, "init_min_tri_angle": 4.0, "abs_pose_min_num_inliers": 15}
 """Thresholds of the incremental mapper where it finds no model with the usual ones."""
 
@@ -91,26 +94,16 @@ def reconstruct(
     _check_enough(photos, good, left_out)
     spent: dict[str, float] = {}
     with quiet():
-        with timed(spent, "features"):
-            copies = numbered(good, work)
-            database = feature_database(good, copies, work, settings)
-            extract(database, copies, settings)
-        with timed(spent, "matching"):
-            match(database, copies.names, settings)
-        with timed(spent, "mapping"):
-            models = _map(database, copies, work, settings.mapper)
-            pairs = _measured_pairs(database, models[0]) if models else []
-            contradicting = contradictions(pairs) if settings.features == "xfeat" else set()
-            if contradicting:  # SIFT's few false pairs never misled the mapper
-                models = _map_without(contradicting, database, copies, work, settings.mapper) or models
-                pairs = _measured_pairs(database, models[0])
-    features, partners = _features_and_partners(database)
+        copies = numbered(good, work)
+        found = _best_mapping(good, copies, work, settings, spent)
+    models = found.models
+    features, partners = _features_and_partners(found.database)
     if not models:
         raise UserError(_why_no_model(features, partners))
     best, names = models[0], dict(zip(copies.names, good.names, strict=True))
     reasons = _reasons(copies.names, models, features, partners)
     placed = rotations_of(best)
-    doubts = doubtful_placements(placed, (p for p in pairs if p.first in placed and p.second in placed))
+    doubts = doubtful_placements(placed, (p for p in found.pairs if p.first in placed and p.second in placed))
     doubtful = {names[best.images[i].name]: why for i, why in sorted(doubts.items())}
     for image in (image for model in models for image in model.images.values()):
         image.name = names[image.name]
@@ -118,7 +111,7 @@ def reconstruct(
         photos=len(photos.names), registered=best.num_reg_images(), points=best.num_points3D(),
         error=float(best.compute_mean_reprojection_error()),
         cameras=len({image.camera_id for image in best.images.values() if image.has_pose}),
-        mapper=settings.mapper, contradicting=len(contradicting), doubtful=doubtful,
+        mapper=settings.mapper, contradicting=len(found.contradicting), doubtful=doubtful,
         left_out=left_out | {names[number]: why for number, why in reasons.items()},
         other_models=tuple(other.num_reg_images() for other in models[1:]),
         seconds={stage: round(seconds, 1) for stage, seconds in spent.items()},
@@ -127,6 +120,70 @@ def reconstruct(
     write_picture(best, doubtful, work)
     replace_file(work / REPORT.name, json.dumps(asdict(report), indent=2))
     return report
+
+
+@dataclass(frozen=True)
+class _Mapping:
+    """Models of photos, and what they are made from."""
+
+    database: Path
+    models: list[pycolmap.Reconstruction]
+    """Largest first."""
+    pairs: list[MatchedPair]
+    contradicting: Collection[tuple[int, int]]
+    """Pairs that contradict others. The models are without them."""
+
+    @property
+    def placed(self) -> int:
+        """Number of photos in the largest model."""
+        return self.models[0].num_reg_images() if self.models else 0
+
+
+def _best_mapping(
+    photos: PhotoFolder,
+    copies: PhotoFolder,
+    work: Path,
+    settings: ReconstructionSettings,
+    spent: dict[str, float],
+) -> _Mapping:
+    """Map, and where plain SIFT leaves many photos without a pose, map again with stronger features.
+
+    Not where sides look alike to SIFT: stronger features put photos on the wrong one."""
+    if settings.features != "auto":
+        return _mapping(photos, copies, work, settings, spent)
+    plain = _mapping(photos, copies, work, replace(settings, features="sift"), spent)
+    count = len(copies.names)
+    enough = plain.placed >= _ENOUGH * count or not plain.pairs
+    if enough or plain.contradicting or count > _MOST_STRONG:
+        return plain
+    say(f"{plain.placed} of {count} photos have a pose: trying stronger features, in three times the time")
+    strong = _mapping(photos, copies, work / "dsp-sift", replace(settings, features="dsp-sift"), spent)
+    return max(plain, strong, key=lambda mapping: mapping.placed)
+
+
+def _mapping(
+    photos: PhotoFolder,
+    copies: PhotoFolder,
+    work: Path,
+    settings: ReconstructionSettings,
+    spent: dict[str, float],
+) -> _Mapping:
+    """Find features and matches, unless an earlier attempt left them in `work`, and map."""
+    work.mkdir(parents=True, exist_ok=True)
+    with timed(spent, "features"):
+        database = feature_database(photos, copies, work, settings)
+        extract(database, copies, settings)
+    with timed(spent, "matching"):
+        match(database, copies.names, settings)
+    with timed(spent, "mapping"):
+        models = _map(database, copies, work, settings.mapper)
+        pairs = _measured_pairs(database, models)
+        # The mapper passes over the false pairs of stronger features by itself.
+        contradicting = contradictions(pairs) if models and settings.features != "dsp-sift" else set()
+        if contradicting:
+            models = _map_without(contradicting, database, copies, work, settings.mapper) or models
+            pairs = _measured_pairs(database, models)
+    return _Mapping(database, models, pairs, contradicting)
 
 
 def reconstruct_scene(
@@ -344,11 +401,11 @@ def _map(
     return sorted(models, key=lambda model: -model.num_reg_images())
 
 
-def _measured_pairs(database: Path, model: pycolmap.Reconstruction) -> list[MatchedPair]:
-    """Measure the rotations of all matched pairs, by the model's cameras where it has them."""
+def _measured_pairs(database: Path, models: Sequence[pycolmap.Reconstruction]) -> list[MatchedPair]:
+    """Measure the rotations of all matched pairs, by the largest model's cameras where it has them."""
     with load_pycolmap().Database.open(database) as db:
         guessed = {image.image_id: db.read_camera(image.camera_id) for image in db.read_all_images()}
-        return matched_pairs(db, guessed | cameras_of(model))
+        return matched_pairs(db, guessed | (cameras_of(models[0]) if models else {}))
 
 
 def _map_without(

@@ -2,6 +2,7 @@
 
 import os
 import shutil
+from types import SimpleNamespace
 
 import numpy as np  # before pycolmap
 import pycolmap
@@ -13,13 +14,13 @@ from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import locked
 from lang3dxl_ns.scene import reconstruct as module
 from lang3dxl_ns.scene.colmap import read_reconstruction
-from lang3dxl_ns.scene.photo_folder import find_photos
+from lang3dxl_ns.scene.photo_folder import PhotoFolder, find_photos
 from lang3dxl_ns.scene.placements import cameras_of, doubtful_placements, matched_pairs, rotations_of
 from lang3dxl_ns.scene.reconstruct import reconstruct, reconstruct_scene
 from lang3dxl_ns.scene.reconstruction import ReconstructionSettings
 from lang3dxl_ns.scene.symmetry import contradictions
 
-SIFT = ReconstructionSettings()
+SIFT = ReconstructionSettings(features="sift")
 
 
 @pytest.fixture(scope="module")
@@ -92,6 +93,34 @@ def test_stronger_features_find_them_too(photos, scene, monkeypatch):
     assert distances.max() < 0.15
 
 
+@pytest.mark.parametrize(
+    ("plain", "contradicting", "strong", "tried", "placed"),
+    [
+        (9, set(), 10, False, 9),  # enough
+        (7, set(), 9, True, 9),
+        (7, set(), 7, True, 7),
+        (7, {(1, 2)}, 9, False, 7),  # sides look alike
+        (0, set(), 5, True, 5),
+    ],
+)
+def test_stronger_features_are_tried_where_plain_ones_leave_photos_without_a_pose(
+    tmp_path, monkeypatch, plain, contradicting, strong, tried, placed
+):
+    asked = []
+
+    def mapped(photos, copies, work, settings, spent):
+        asked.append((settings.features, work))
+        count = plain if settings.features == "sift" else strong
+        models = [SimpleNamespace(num_reg_images=lambda: count)] if count else []
+        return module._Mapping(work / "database.db", models, [object()], contradicting)
+
+    monkeypatch.setattr(module, "_mapping", mapped)
+    ten = PhotoFolder(tmp_path, tuple(map(str, range(10))))
+    best = module._best_mapping(ten, ten, tmp_path, ReconstructionSettings(), {})
+    assert best.placed == placed
+    assert asked == [("sift", tmp_path), ("dsp-sift", tmp_path / "dsp-sift")][: 1 + tried]
+
+
 def test_what_matches_measure_agrees_with_the_model(reconstructed):
     """Else an honest model would be doubted; and a photo that is turned in it is."""
     data, model, _ = reconstructed
@@ -107,8 +136,8 @@ def test_what_matches_measure_agrees_with_the_model(reconstructed):
     }
 
 
-@pytest.mark.parametrize(("kind", "points"), [("xfeat", [15, 30]), ("sift", [15])])
-def test_contradicting_pairs_of_learned_matches_are_left_out_of_a_second_model(
+@pytest.mark.parametrize(("kind", "points"), [("xfeat", [15, 30]), ("sift", [15, 30]), ("dsp-sift", [15])])
+def test_contradicting_pairs_are_left_out_of_a_second_model_but_where_the_mapper_passes_over_them(
     photos, monkeypatch, capsys, kind, points
 ):
     """The pair is honest here, so all photos keep a pose by others. The database keeps it. More
@@ -134,7 +163,7 @@ def test_contradicting_pairs_of_learned_matches_are_left_out_of_a_second_model(
 def test_honest_photos_have_no_contradictions(reconstructed):
     data, model, _ = reconstructed
     database = data / "lang3dxl_cache/reconstruction/database.db"
-    pairs = module._measured_pairs(database, pycolmap.Reconstruction(model))
+    pairs = module._measured_pairs(database, [pycolmap.Reconstruction(model)])
     assert len(pairs) >= 7 and contradictions(pairs) == set()
 
 
