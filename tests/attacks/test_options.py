@@ -192,8 +192,8 @@ def test_a_run_of_the_same_name_keeps_its_checkpoints(tmp_path, scene):
     with pytest.raises(UserError, match="is of an earlier run: resume it"):
         config_of_mine()
     config_of_mine(load_dir=checkpoints)
-    with pytest.raises(UserError, match="warmup-length has no effect here"):
-        config_of_mine(load_dir=checkpoints, warmup_length=7)
+    with pytest.raises(UserError, match="clip-weight has no effect"):
+        config_of_mine(load_dir=checkpoints, clip_weight=0.0)
 
 
 def test_two_runs_that_start_in_one_second_have_a_folder_each(tmp_path, scene):
