@@ -113,15 +113,13 @@ def versions() -> Iterator[Finding]:
 def _nerfstudio_half(installed: bool) -> tuple[str, bool, str]:
     """Say whether nerfstudio is there and, if not, whether it can be."""
     if installed:
-        return "installed: the demo, ns-train, ns-eval, and its viewer work", True, ""
-    base = "not installed: lang3dxl train, asking, attaching and the page work without it"
+        return "installed: ns-train, ns-eval and its viewer work", True, ""
+    base = "not installed: the demo, lang3dxl train, asking, attaching and the page work without it"
     if sys.version_info[:2] >= (3, 13):
         python = f"{sys.version_info[0]}.{sys.version_info[1]}"
-        remedy = (
-            f"for the demo and ns-train: an environment of Python 3.10 to 3.12 (it pins what {python} lacks)"
-        )
+        remedy = f"for ns-train: an environment of Python 3.10 to 3.12 (it pins what {python} lacks)"
         return base, False, remedy
-    return base, False, "for the demo and ns-train: pip install -e '.[nerfstudio]' in the checkout"
+    return base, False, "for ns-train: pip install -e '.[nerfstudio]' in the checkout"
 
 
 def devices() -> Iterator[Finding]:

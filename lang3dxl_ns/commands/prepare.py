@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 class Reconstruct(ReconstructionSettings):
     """Reconstruct photos: cameras, poses and points, as a COLMAP model.
 
-    `ns-train lang3dxl` does this itself for photos without a model; this command does it in advance. It can
-    be interrupted and repeated at any time, and never replaces an existing model, except by one with photos
+    Training does this itself for photos without a model; this command does it in advance. It can be
+    interrupted and repeated at any time, and never replaces an existing model, except by one with photos
     added, of which the old form is kept.
     """
 
@@ -44,7 +44,7 @@ class Reconstruct(ReconstructionSettings):
             model = add_photos(self.data, self.add, self.cache_dir, self)
             return say(f"The model is in {model}")
         data, model = reconstruct_scene(self.data, self.cache_dir, self)
-        say(f"The model is in {model}. Train with: ns-train lang3dxl --data {shlex.quote(str(data))}")
+        say(f"The model is in {model}. Train with: lang3dxl train {shlex.quote(str(data))}")
 
 
 @showing("data", "clip", "quality", "foreground", "workers", "cache_dir")
@@ -52,8 +52,8 @@ class Reconstruct(ReconstructionSettings):
 class Prepare(PreparationConfig):
     """Make the targets that training learns from, in advance.
 
-    They are CLIP features of crops in physical scale, and dense features. `ns-train lang3dxl` makes missing
-    targets itself. This command can be interrupted and repeated at any time.
+    They are CLIP features of crops in physical scale, and dense features. Training makes missing targets
+    itself. This command can be interrupted and repeated at any time.
     """
 
     data: Path
@@ -80,7 +80,7 @@ class Prepare(PreparationConfig):
 class Needs(PreparationConfig):
     """Measure a scene's needs without training: which optional components will be built, and why.
 
-    `ns-train lang3dxl` measures the same, and applies it to every component left at "auto".
+    Training measures the same, and applies it to every component left at "auto".
     """
 
     data: Path

@@ -13,7 +13,7 @@ from lang3dxl_ns.scene.record import SCENE_FILE
 
 OUTPUTS = Path("outputs")
 """Folder in which `ns-train` creates runs."""
-_REMEDY = "name a run's folder or config.yml, or train with ns-train lang3dxl --data FOLDER"
+_REMEDY = "name a run's folder or config.yml, or train one with lang3dxl train FOLDER"
 _DEEPEST = 4
 """Deepest level of a run's folder below the given one; outputs/ holds SCENE/METHOD/TIME."""
 
