@@ -36,6 +36,9 @@ _KNOWN: WeakKeyDictionary[Answering, list[Thing]] = WeakKeyDictionary()
 """Things that were found in each scene so far: they keep their ids."""
 SURE = 0.6
 """Number of views, relative to the typical thing's, above which a thing is sure."""
+MISSED = 1.4
+"""Likely number of things for each one found, at most: what few photos show is missed. So ranges of windows
+hold on six of six validation landmarks, and with the candidates alone on four."""
 SAME = 0.5
 """Overlap (intersection over union of weights) from which two words' things are one."""
 
@@ -65,7 +68,7 @@ class Things:
     @property
     def most(self) -> int:
         """Highest number of things that is likely."""
-        return len(self.things) + len(self.candidates)
+        return max(len(self.things) + len(self.candidates), int(MISSED * len(self.things)))
 
     @property
     def count(self) -> str:

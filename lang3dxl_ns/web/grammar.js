@@ -2,7 +2,7 @@
 import { dot } from "./answer.js";
 import language from "./language.js";
 
-const { grammar } = language, { BESIDE, INSIDE, CLOSE, VIEWS, SURE } = language.things;
+const { grammar } = language, { BESIDE, INSIDE, CLOSE, VIEWS, SURE, MISSED } = language.things;
 const has = (table, word) => Object.hasOwn(table, word);
 const any = (phrases) => [...(Array.isArray(phrases) ? phrases : Object.keys(phrases))].sort((a, b) => b.length - a.length).join("|");
 const plain = (text) => text.trim().replace(new RegExp(`^(?:(?:${any(grammar.articles)})\\s+)+`), "");
@@ -85,7 +85,7 @@ export function sureOf(things) {
 
 /** How many there are, such as "34, perhaps 31 to 37". after: a text behind the number. */
 export function count({ things, candidates }, after = "") {
-  const least = sureOf(things).length, most = things.length + candidates.length;
+  const least = sureOf(things).length, most = Math.max(things.length + candidates.length, Math.floor(MISSED * things.length));
   return things.length + after + (least === most ? "" : `, perhaps ${least} to ${most}`);
 }
 

@@ -65,7 +65,7 @@ _NUMBERS = (
     ("things", pieces, "LEVELS PART DEPTH FILLED"),
     ("things", join, "SHARED SPLINTER VIEWS CRUMB OFTEN OVER SLIM STRAIGHT"),
     ("things", thing, "OUTLIERS"),
-    ("things", find, "COLORED SAME SURE"),
+    ("things", find, "COLORED SAME SURE MISSED"),
     ("things", grammar, "BESIDE INSIDE CLOSE"),
 )
 """Numbers that rank views, tell things apart and relate them, by the modules that hold them."""
