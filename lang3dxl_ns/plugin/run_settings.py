@@ -7,7 +7,7 @@ import re
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import MISSING, fields, is_dataclass
-from enum import Enum
+from enum import Enum, EnumMeta
 from functools import cache
 from pathlib import Path, PurePath, PurePosixPath, PureWindowsPath
 from typing import Any, get_type_hints
@@ -183,6 +183,8 @@ class _SettingsLoader(yaml.UnsafeLoader):
         self, suffix: str, node: Any, args: Any = None, kwds: Any = None, newobj: bool = False
     ) -> Any:
         """Construct settings (without calling them), paths and enumeration members."""
+        if suffix == "builtins.getattr" and len(args or ()) == 2 and isinstance(args[0], EnumMeta):
+            return args[0][args[1]]  # Python 3.11.0 to 3.11.3, Debian's, writes members so
         kind = self.find_python_name(suffix, node.start_mark)
         if not (is_dataclass(kind) and newobj) and not issubclass(kind, PurePath | Enum):
             raise yaml.constructor.ConstructorError(None, None, f"it asks to call {suffix}", node.start_mark)

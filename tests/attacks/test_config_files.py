@@ -26,6 +26,8 @@ TRAPS = [
     "!!python/object/apply:nerfstudio.engine.trainer.Trainer ['touch {trap}']",
     "!!python/object/new:subprocess.Popen [['touch', '{trap}']]",
     "!!python/object/new:lang3dxl_ns.plugin.model.Lang3DXLModel []",
+    "!!python/object/apply:builtins.getattr [!!python/name:nerfstudio.utils.writer.EventName '', mro]",
+    "!!python/object/apply:builtins.getattr [!!python/name:nerfstudio.engine.trainer.Trainer '', train]",
     "!!python/name:os.system ''",
     "!!python/name:torch.hub.load ''",
     "!!python/module:antigravity ''",
@@ -52,6 +54,21 @@ def trapped(folder, text):
     lines.insert(1, f"vis: {trap}")
     (folder / "config.yml").write_text("\n".join(lines))
     return folder / "config.yml", folder / "trap"
+
+
+def test_members_of_enumerations_are_read_as_every_python_writes_them(copy):
+    """Python 3.11.0 to 3.11.3, which Debian has, write them as attributes of their class."""
+    path = copy / "config.yml"
+    own = read_config(path).logging.local_writer.stats_to_track
+    of = "!!python/name:nerfstudio.utils.writer.EventName ''"
+    text = path.read_text()
+    for event in own:
+        for written in (f"EventName\n      - {event.value}\n", f"EventName\n      - '{event.value}'\n"):
+            attribute = f"builtins.getattr\n      - {of}\n      - {event.name}\n"
+            text = text.replace(f"nerfstudio.utils.writer.{written}", attribute)
+    path.write_text(text)
+    assert text.count("builtins.getattr") == len(own)
+    assert read_config(path).logging.local_writer.stats_to_track == own
 
 
 @pytest.mark.parametrize(

@@ -68,9 +68,9 @@ def test_wrong_places_are_one_sentence(runs, place):
 
 def test_folders_without_a_run_say_how_to_make_one(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(UserError, match=r"no outputs/ here.*ns-train"):
+    with pytest.raises(UserError, match=r"no outputs/ here.*lang3dxl train"):
         find_config()
-    with pytest.raises(UserError, match=r"holds no run.*ns-train"):
+    with pytest.raises(UserError, match=r"holds no run.*lang3dxl train"):
         find_config(tmp_path)
 
 
