@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from typing import Any
 
 import torch
@@ -29,9 +28,8 @@ from lang3dxl_ns.plugin.inert_settings import OF_SPLATFACTO
 from lang3dxl_ns.plugin.splatfacto import SplatfactoModel, SplatfactoModelConfig
 from lang3dxl_ns.preparation.targets import FACTS, Batch, SceneFacts, foreground
 from lang3dxl_ns.query.question import Question, pictures
-from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.rendering import Rendering
-from lang3dxl_ns.things.find import Things, things_of
+from lang3dxl_ns.things.find import Things
 from lang3dxl_ns.things.write import outlined
 from lang3dxl_ns.training.conversation import Conversation
 from lang3dxl_ns.training.parts import CameraRefinement
@@ -59,23 +57,21 @@ class Lang3DXLModelConfig(TrainingSettings, SplatfactoModelConfig):  # type: ign
 class RenderedAnswers:
     """The outputs that `ns-render` adds to every rendering, as a viewer's `Conversation` does."""
 
-    scene: Scene
     question: Question
+    things: Sequence[Things] = ()
+    """Things whose outlines are drawn; none unless a command asks for them, since finding them takes time."""
     shows_bottleneck: bool = True
 
     def channels(self) -> Tensor:
         """Return the values that Gaussians carry in a rendering."""
         return self.question.channels
 
-    @cached_property
-    def things(self) -> list[Things]:
-        """The single things that the question names, found once."""
-        return things_of(self.scene, self.question)
-
     def outputs(self, rendering: Rendering, seconds: float) -> dict[str, Tensor]:
-        """Return the outputs that answer the question, and `things`: their numbered outlines."""
-        outlines = torch.tensor(outlined(rendering, self.things) / 255.0).to(rendering.rgb)
-        return pictures(rendering, self.question) | {"things": outlines}
+        """Return the outputs that answer the question, and the things' numbered outlines."""
+        outputs = pictures(rendering, self.question)
+        if self.things:
+            outputs["things"] = torch.tensor(outlined(rendering, self.things) / 255.0).to(rendering.rgb)
+        return outputs
 
 
 class Lang3DXLModel(SplatfactoModel):

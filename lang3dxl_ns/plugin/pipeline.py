@@ -26,6 +26,7 @@ from lang3dxl_ns.plugin.load_scene import model_state
 from lang3dxl_ns.plugin.model import Lang3DXLModel, Lang3DXLModelConfig, RenderedAnswers
 from lang3dxl_ns.plugin.panel import AskPanel
 from lang3dxl_ns.scene.record import SCENE_FILE, SceneRecord
+from lang3dxl_ns.things.find import things_of
 from lang3dxl_ns.training.learn_codes import begin_codes, learn_words
 from lang3dxl_ns.training.snapshot import snapshot
 
@@ -109,7 +110,10 @@ class Lang3DXLPipeline(VanillaPipeline):
             cache = None if run is None else run / "lang3dxl_visible.safetensors"
             CONSOLE.log(f"Looking for {escape(self.query)}")
             scene = snapshot(self.model.run, self.scene_file, cache=cache)
-            self.model.answers = RenderedAnswers(scene, scene.ask(self.query))
+            question = scene.ask(self.query)
+            # ns-render doesn't tell a model which outputs it wants, and finding things takes a while.
+            things = things_of(scene, question) if "things" in sys.argv else []
+            self.model.answers = RenderedAnswers(question, things)
 
     def learn_words(self) -> None:
         """Gather the training photos' features onto the present Gaussians, and learn codes."""
