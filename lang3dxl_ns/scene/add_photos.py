@@ -90,7 +90,7 @@ def add_photos(
         data: the scene's folder, with photos and a COLMAP model.
         folder: new photos; may lie among the scene's.
         cache_dir: folder for features and matches; by default lang3dxl_cache in `data`.
-        settings: as for `reconstruct`; the mapper has no meaning here.
+        settings: as for `reconstruct`; the mapper has no meaning here, and features "auto" are plain SIFT's.
     """
     settings = settings or ReconstructionSettings()
     check_settings(settings)

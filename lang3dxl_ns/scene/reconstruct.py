@@ -11,9 +11,10 @@ import json
 import os
 import shutil
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from importlib.util import find_spec
 from io import BytesIO
 from pathlib import Path
@@ -95,7 +96,7 @@ def reconstruct(
     spent: dict[str, float] = {}
     with quiet():
         copies = numbered(good, work)
-        found = _best_mapping(good, copies, work, settings, spent)
+        found = _best_mapping(partial(_mapping, good, copies, spent), len(good.names), work, settings)
     models = found.models
     features, partners = _features_and_partners(found.database)
     if not models:
@@ -140,33 +141,31 @@ class _Mapping:
 
 
 def _best_mapping(
-    photos: PhotoFolder,
-    copies: PhotoFolder,
+    mapped: Callable[[Path, ReconstructionSettings], _Mapping],
+    count: int,
     work: Path,
     settings: ReconstructionSettings,
-    spent: dict[str, float],
 ) -> _Mapping:
-    """Map, and where plain SIFT leaves many photos without a pose, map again with stronger features.
+    """Map so many photos, and where plain SIFT leaves many without a pose, map again with stronger features.
 
     Not where sides look alike to SIFT: stronger features put photos on the wrong one."""
     if settings.features != "auto":
-        return _mapping(photos, copies, work, settings, spent)
-    plain = _mapping(photos, copies, work, replace(settings, features="sift"), spent)
-    count = len(copies.names)
+        return mapped(work, settings)
+    plain = mapped(work, replace(settings, features="sift"))
     enough = plain.placed >= _ENOUGH * count or not plain.pairs
     if enough or plain.contradicting or count > _MOST_STRONG:
         return plain
     say(f"{plain.placed} of {count} photos have a pose: trying stronger features, in three times the time")
-    strong = _mapping(photos, copies, work / "dsp-sift", replace(settings, features="dsp-sift"), spent)
+    strong = mapped(work / "dsp-sift", replace(settings, features="dsp-sift"))
     return max(plain, strong, key=lambda mapping: mapping.placed)
 
 
 def _mapping(
     photos: PhotoFolder,
     copies: PhotoFolder,
+    spent: dict[str, float],
     work: Path,
     settings: ReconstructionSettings,
-    spent: dict[str, float],
 ) -> _Mapping:
     """Find features and matches, unless an earlier attempt left them in `work`, and map."""
     work.mkdir(parents=True, exist_ok=True)

@@ -14,7 +14,7 @@ from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import locked
 from lang3dxl_ns.scene import reconstruct as module
 from lang3dxl_ns.scene.colmap import read_reconstruction
-from lang3dxl_ns.scene.photo_folder import PhotoFolder, find_photos
+from lang3dxl_ns.scene.photo_folder import find_photos
 from lang3dxl_ns.scene.placements import cameras_of, doubtful_placements, matched_pairs, rotations_of
 from lang3dxl_ns.scene.reconstruct import reconstruct, reconstruct_scene
 from lang3dxl_ns.scene.reconstruction import ReconstructionSettings
@@ -104,19 +104,17 @@ def test_stronger_features_find_them_too(photos, scene, monkeypatch):
     ],
 )
 def test_stronger_features_are_tried_where_plain_ones_leave_photos_without_a_pose(
-    tmp_path, monkeypatch, plain, contradicting, strong, tried, placed
+    tmp_path, plain, contradicting, strong, tried, placed
 ):
     asked = []
 
-    def mapped(photos, copies, work, settings, spent):
+    def mapped(work, settings):
         asked.append((settings.features, work))
         count = plain if settings.features == "sift" else strong
         models = [SimpleNamespace(num_reg_images=lambda: count)] if count else []
         return module._Mapping(work / "database.db", models, [object()], contradicting)
 
-    monkeypatch.setattr(module, "_mapping", mapped)
-    ten = PhotoFolder(tmp_path, tuple(map(str, range(10))))
-    best = module._best_mapping(ten, ten, tmp_path, ReconstructionSettings(), {})
+    best = module._best_mapping(mapped, 10, tmp_path, ReconstructionSettings())
     assert best.placed == placed
     assert asked == [("sift", tmp_path), ("dsp-sift", tmp_path / "dsp-sift")][: 1 + tried]
 
