@@ -429,8 +429,10 @@ function settle(hash = null) {
 // ── controls ──
 
 /** Offer words while the user types; the browser chooses among them. */
-function offer() {
-  const typed = $("word").value, before = typed.slice(0, typed.lastIndexOf(";") + 1);
+function offer({ type }) {
+  const typed = $("word").value, before = typed.slice(0, typed.lastIndexOf(";") + 1), { dataset } = $("offered");
+  if (type === "input" && dataset.before === before) return; // thousands of words, of which only the prefix changes
+  dataset.before = before;
   $("offered").replaceChildren(...words().map((word) => element("option", { value: before + word })));
 }
 
@@ -446,7 +448,7 @@ function listen() {
     $("word").value = "";
     return tidy(typed) ? ask(typed) : null;
   });
-  for (const kind of ["input", "focus"]) on("word", kind, () => reading.then(offer));
+  for (const kind of ["input", "focus"]) on("word", kind, (event) => reading.then(() => offer(event)));
   on("clear", "click", clear);
   on("overview", "click", () => (photos.hide(), quiet(), view.mover.overview()));
   on("teach", "click", () => startWord().card.querySelector("button").focus()); // no name yet: a phone's keyboard would cover the view
