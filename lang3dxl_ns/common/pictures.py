@@ -152,9 +152,10 @@ def mask_values(image: Image.Image) -> Image.Image:
 
     Gray masks are taken as they are, unless they hold only 0 and 1, as NumPy's do: 1 then marks the
     foreground. In masks with colors, as segmenters paint them, black is the background: colors of a palette
-    mark the foreground, and in other pictures the brightest channel counts. Cut-outs are opaque there.
+    mark the foreground, and in other pictures the brightest channel counts. Of a photo that is
+    cut out, the opaque part does.
     """
-    if image.has_transparency_data and _is_cut_out(image):
+    if _is_cut_out(image):
         return opacity(image)
     if not image.has_transparency_data and image.mode in ("P", "RGB"):
         colors = np.asarray(image.convert("RGB"))
@@ -177,9 +178,10 @@ def see_through(image: Image.Image) -> bool:
 
 def _is_cut_out(image: Image.Image) -> bool:
     """Return whether parts are transparent, and the others a photo or dark: no mask in black and white."""
+    if not see_through(image):
+        return False
     shown = np.asarray(image.convert("L"))[np.asarray(opacity(image)) >= 128]
-    drawn = shown.size > 0 and (shown.max() < 128 or np.mean((shown > 16) & (shown < 239)) > 0.1)
-    return bool(drawn) and see_through(image)
+    return shown.size > 0 and bool(shown.max() < 128 or np.mean((shown > 16) & (shown < 239)) > 0.1)
 
 
 def eight_bits(image: Image.Image) -> Image.Image:

@@ -209,7 +209,8 @@ def read_glb(path: Path) -> Splats:
         raise UserError(f"it holds no splats ({_SPLATS}): export it as a splat")
     if len(splats) > 1:
         say(f"{path} holds {len(splats)} splats, of which the first is read: join them in a splat editor")
-    named = (found := splats[0])["attributes"]
+    found = splats[0]
+    named = found["attributes"]
     for name, about in (found["extensions"][_SPLATS].get("extensions") or {}).items():
         if not name.startswith(_SPZ):
             raise UserError(f"its splats are compressed by {name}: export them without compression")

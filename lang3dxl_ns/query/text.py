@@ -215,5 +215,7 @@ def text_encoder(file: SceneRecord, device: torch.device | str) -> EncodeTexts:
         raise UserError(NO_SEMANTICS)
     encoder = load_image_text_encoder(file.clip, device)
     if not same_clip(encoder.identity, file.clip_identity):
-        raise UserError(f"the CLIP in {file.clip} is not the one that this scene was made with: restore it")
+        raise UserError(
+            f"the CLIP in {file.clip} is not the one that this scene was made with: restore it, or train anew"
+        )
     return encoder.encode_texts

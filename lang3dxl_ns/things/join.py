@@ -61,9 +61,8 @@ def join(pieces: Sequence[Piece], weight: Float[Array, " n"], box: Callable[[Joi
     pinnacle). `weight`: of each Gaussian, 0 and above; `box`: of a thing.
     """
     owner, things = np.full(len(weight), -1), list[Joined]()
-    seen = defaultdict[tuple[int, ...], set[str]](
-        set
-    )  # photos that show a thing, and those of two in one piece
+    # Photos that show a thing, and those that show two in one piece.
+    seen = defaultdict[tuple[int, ...], set[str]](set)
     for piece in sorted(pieces, key=lambda piece: (piece.cut, -piece.resolution)):
         mine, total = owner[piece.rows], weight[piece.rows].sum()
         if total <= 0:

@@ -145,5 +145,7 @@ def write_things(scene: Scene, answers: Sequence[Things], folder: Path, look: st
 
 
 def _each_once(answers: Sequence[Things]) -> list[Thing]:
-    things = [thing for one in answers for thing in one.things]
-    return list({thing.id: thing for thing in reversed(things)}.values())[::-1]
+    first: dict[int, Thing] = {}
+    for thing in (thing for one in answers for thing in one.things):
+        first.setdefault(thing.id, thing)
+    return list(first.values())

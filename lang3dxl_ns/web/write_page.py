@@ -151,7 +151,9 @@ class Page:
             "colors": PROMPT_COLORS,
             "live": self.live,
             "prompts": _phrases(self.prompts),
-            **{"words": None, "names": [], "suggested": []},
+            "words": None,
+            "names": [],
+            "suggested": [],
         }
         if self.levels is not None:
             files |= self._chunks(self.levels, center)
@@ -187,7 +189,7 @@ class Page:
             about["foreground"] = _phrases(self._foreground)
             if self._foreground:
                 within = scene.ask(self._foreground, foreground="").gaussians.any(0)
-                files["foreground.bin"] = _bytes(within / 255)
+                files["foreground.bin"] = within.byte().cpu().numpy().tobytes()
             named = _distinct([*(word.name for word in scene.words.values()), *self.words, *self.more])
             about["names"] = [name for name in named if phrases_of(name) != [(name, [])]]
             about["suggested"] = self._suggested()
