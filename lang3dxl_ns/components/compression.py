@@ -249,6 +249,10 @@ class _LearningField(SemanticField):
         draws = self.learning_steps(count) * self.compression.batch
         return draws * _SECONDS_PER_DRAW + count * _SECONDS_PER_GAUSSIAN
 
+    def _drawn(self, gathered: Gathered) -> tuple[CompressionConfig, Gathered, torch.Generator]:
+        generator, config = torch.Generator().manual_seed(0), self.compression.grown(len(gathered))
+        return config, draw_sample(seen_by_photos(gathered), config.sample, generator), generator
+
 
 class CompressedField(_LearningField):
     """Semantic field of a scene whose features are gathered onto its Gaussians after training. It decodes
@@ -267,9 +271,7 @@ class CompressedField(_LearningField):
         self, gathered: Gathered, advance: Callable[[], None] = lambda: None
     ) -> Float[Tensor, "n code"]:
         """Learn codes of three numbers, or of more if three lose too much and the settings allow it."""
-        generator = torch.Generator().manual_seed(0)
-        config = self.compression.grown(len(gathered))
-        sample = draw_sample(seen_by_photos(gathered), config.sample, generator)
+        config, sample, generator = self._drawn(gathered)
         state = generator.get_state()
         dims = CODE_DIMS if self.config.code_dim is None else (self.config.code_dim,)
         lost = ""
@@ -312,7 +314,5 @@ class JointField(_LearningField):
         self, gathered: Gathered, advance: Callable[[], None] = lambda: None
     ) -> Float[Tensor, "n code"]:
         """Learn codes from which training continues, and train the field to decode them."""
-        generator = torch.Generator().manual_seed(0)
-        config = self.compression.grown(len(gathered))
-        sample = draw_sample(seen_by_photos(gathered), config.sample, generator)
+        config, sample, generator = self._drawn(gathered)
         return assign(gathered, self, fit(sample, self, config, generator, advance, _BLENDS))

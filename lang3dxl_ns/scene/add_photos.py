@@ -30,18 +30,10 @@ from lang3dxl_ns.common.files import expanded, locked, make_folder, read_json, r
 from lang3dxl_ns.scene.colmap import load_pycolmap, read_reconstruction
 from lang3dxl_ns.scene.companions import cache_folder, inside
 from lang3dxl_ns.scene.layout import find_model, has_model, images_folder
+from lang3dxl_ns.scene.matching import extract, feature_database, match, numbered, quiet, usable
 from lang3dxl_ns.scene.photo_folder import PhotoFolder, find_photos, shared_cameras
 from lang3dxl_ns.scene.placements import doubtful_placements, matched_pairs
-from lang3dxl_ns.scene.reconstruct import (
-    check_settings,
-    extract,
-    feature_database,
-    match,
-    numbered,
-    quiet,
-    usable,
-    write_picture,
-)
+from lang3dxl_ns.scene.reconstruct import check_settings, write_picture
 from lang3dxl_ns.scene.reconstruction import (
     REPORT,
     ReconstructionSettings,

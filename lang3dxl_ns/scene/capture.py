@@ -33,11 +33,13 @@ from lang3dxl_ns.scene.layout import (
     whole_scene,
 )
 from lang3dxl_ns.scene.masks import mask_folder
+from lang3dxl_ns.scene.matching import shows_these
 from lang3dxl_ns.scene.names import listed, resolve
 from lang3dxl_ns.scene.photo import Photo, upright_in_model
-from lang3dxl_ns.scene.photo_folder import extract_frames, find_photos, frames_folder, is_video, photos_below
-from lang3dxl_ns.scene.reconstruct import reconstruct_scene, shows_these
+from lang3dxl_ns.scene.photo_folder import find_photos, photos_below
+from lang3dxl_ns.scene.reconstruct import reconstruct_scene
 from lang3dxl_ns.scene.transforms import SPLITS, TRANSFORMS, Transforms, read_transforms
+from lang3dxl_ns.scene.video import extract_frames, frames_folder, is_video
 
 _OWN_MODEL = Path("lang3dxl_cache/reconstruction/sparse/0")
 """Folder of a model that is reconstructed here, if sparse/ is taken."""

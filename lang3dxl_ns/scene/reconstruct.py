@@ -1,18 +1,13 @@
 """Structure from motion: from a folder of photos to cameras, poses and points, with COLMAP's library.
 
-Features and matches are stored in a database as they are made, so that an interrupted reconstruction can be
-resumed; the model is written only when it is complete.
+Features and matches outlive an interruption (`matching`); the model is written only when it is complete.
 """
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
-import shutil
-from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from importlib.util import find_spec
@@ -25,26 +20,23 @@ import numpy as np
 
 from lang3dxl_ns.common.checks import check_numbers
 from lang3dxl_ns.common.console import progress, say
-from lang3dxl_ns.common.errors import DAMAGE, UserError, is_plain
-from lang3dxl_ns.common.files import expanded, locked, read_json, replace_file
-from lang3dxl_ns.common.memory import machine_memory
-from lang3dxl_ns.common.pictures import open_picture
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.files import expanded, locked, replace_file
 from lang3dxl_ns.common.reports import timed
 from lang3dxl_ns.scene.camera_picture import camera_picture
 from lang3dxl_ns.scene.colmap import load_pycolmap
 from lang3dxl_ns.scene.companions import cache_folder
-from lang3dxl_ns.scene.learned_features import LearnedMatcher, extract_learned
-from lang3dxl_ns.scene.pairing import pairs_to_match
-from lang3dxl_ns.scene.photo_folder import (
-    PhotoFolder,
-    extract_frames,
-    find_photos,
-    is_video,
-    readable,
-    shared_cameras,
+from lang3dxl_ns.scene.matching import (
+    extract,
+    feature_database,
+    features_and_partners,
+    match,
+    numbered,
+    quiet,
+    usable,
 )
+from lang3dxl_ns.scene.photo_folder import PhotoFolder, find_photos
 from lang3dxl_ns.scene.placements import (
-    LEAST_MATCHES,
     MatchedPair,
     cameras_of,
     doubtful_placements,
@@ -59,18 +51,13 @@ from lang3dxl_ns.scene.reconstruction import (
     picture_line,
 )
 from lang3dxl_ns.scene.symmetry import contradictions, copy_without
+from lang3dxl_ns.scene.video import extract_frames, is_video
 
 if TYPE_CHECKING:
     import pycolmap
 
-_MEMORY_PER_THREAD = 1e9  # bytes that SIFT takes on a photo of 1600 pixels, the default `max_size`
 _FEW_FEATURES = 50
 _SMALLEST_MODEL = 3  # photos; COLMAP's default of ten may exceed the number of photos
-_ENDINGS = {"JPEG": ".jpg", "MPO": ".jpg", "PNG": ".png", "TIFF": ".tif", "BMP": ".bmp"}
-"""Formats that COLMAP reads; others become JPEGs of this quality."""
-_QUALITY = 98
-_CHUNK_PHOTOS, _CHUNK_PAIRS, _CHUNK_LEARNED = 8, 100, 5  # a step of the bar, which a killed process loses
-_STAMP = "photos.json"
 _POINTS, _POINTS_OF_TWINS = 15, 30
 """Fewest points that agree on a photo's pose, and fewest where sides look alike, as COLMAP's mapper has it: a
 quarter more photos of a hall get one, but 15 points also agree on the wrong side."""
@@ -98,7 +85,7 @@ def reconstruct(
         copies = numbered(good, work)
         found = _best_mapping(partial(_mapping, good, copies, spent), len(good.names), work, settings)
     models = found.models
-    features, partners = _features_and_partners(found.database)
+    features, partners = features_and_partners(found.database)
     if not models:
         raise UserError(_why_no_model(features, partners))
     best, names = models[0], dict(zip(copies.names, good.names, strict=True))
@@ -217,32 +204,6 @@ def model_in(folder: Path) -> bool:
     return any(folder.glob("images.*")) or any(folder.glob("*/images.*"))
 
 
-def shows_these(work: Path, data: Path) -> bool:
-    """Return whether most photos of the reconstruction in `work` are in the folder `data`, by name and size.
-    A cache may be another scene's. The answer is also yes if `work` doesn't tell its photos."""
-    try:
-        recorded = {(name, size) for name, size, _ in read_json(work / _STAMP)["photos"]}
-    except DAMAGE:
-        return True
-    photos = find_photos(data)
-    here = {(name, (photos.folder / name).stat().st_size) for name in photos.names}
-    return 2 * len(recorded & here) > len(recorded)
-
-
-def usable(photos: PhotoFolder) -> tuple[PhotoFolder, dict[str, str]]:
-    """Separate the readable photos, without duplicate files, from the others, for which reasons are given."""
-    good, left_out = readable(photos)
-    first: dict[bytes, str] = {}
-    for name in good.names:
-        if not is_plain(name):  # a COLMAP model can't hold it
-            left_out[name] = "its name is not plain text: rename the file"
-            continue
-        content = hashlib.blake2b((photos.folder / name).read_bytes()).digest()
-        if first.setdefault(content, name) != name:
-            left_out[name] = f"the same file as {first[content]}"
-    return PhotoFolder(photos.folder, tuple(first.values())), left_out
-
-
 def _check_enough(photos: PhotoFolder, good: PhotoFolder, left_out: Mapping[str, str]) -> None:
     """Raise UserError if fewer than two photos are usable."""
     if len(good.names) >= 2:
@@ -259,119 +220,6 @@ def _check_enough(photos: PhotoFolder, good: PhotoFolder, left_out: Mapping[str,
         f"of the {len(photos.names)} photos in {photos.folder} {len(good.names)} are usable, but a scene "
         f"needs at least three different ones: {name}: {why}"
     )
-
-
-def numbered(photos: PhotoFolder, work: Path) -> PhotoFolder:
-    """Link the photos under numbers, in their order; formats that COLMAP can't read become converted copies.
-    COLMAP separates names by spaces, so "photo 1.jpg" would be two names."""
-    folder = work / "numbered"  # not "photos", a name that people use
-    shutil.rmtree(folder, ignore_errors=True)
-    folder.mkdir(parents=True)
-    numbers = []
-    for index, name in enumerate(photos.names):
-        source = photos.folder / name
-        with open_picture(source) as image:  # browsers save WebP under other endings
-            foreign = image.format not in _ENDINGS
-            number = f"{index:06d}{_ENDINGS.get(image.format or '', '.jpg')}"
-            if foreign:  # COLMAP reads the focal length from EXIF
-                exif = image.info.get("exif", b"")
-                image.convert("RGB").save(folder / number, quality=_QUALITY, subsampling=0, exif=exif)
-        if not foreign:
-            try:
-                (folder / number).symlink_to(source.absolute())
-            except OSError:  # the disk or system has no links
-                shutil.copyfile(source, folder / number)
-        numbers.append(number)
-    return PhotoFolder(folder, tuple(numbers))
-
-
-def feature_database(
-    photos: PhotoFolder, copies: PhotoFolder, work: Path, settings: ReconstructionSettings
-) -> Path:
-    """Make the database of photos and cameras, or reuse one with the same photos and settings."""
-    pycolmap = load_pycolmap()
-    states = [(photos.folder / name).stat() for name in photos.names]
-    stamp = json.dumps(
-        {
-            "photos": [[n, s.st_size, s.st_mtime_ns] for n, s in zip(photos.names, states, strict=True)],
-            "settings": [settings.max_size, settings.max_features, settings.one_camera, copies.names],
-            "features": settings.features,
-        }
-    )
-    database, stamped = work / "database.db", work / _STAMP
-    if database.is_file() and stamped.is_file() and stamped.read_text() == stamp:
-        return database
-    for old in (stamped, *work.glob("database.db*"), *work.glob("importing.db*"), *work.glob("xfeat/*")):
-        old.unlink(missing_ok=True)
-    importing = work / "importing.db"
-    pycolmap.Database.open(importing).close()
-    groups = shared_cameras(photos)
-    if settings.one_camera is not None:
-        groups = [list(photos.names)] if settings.one_camera else [[name] for name in photos.names]
-    number = dict(zip(photos.names, copies.names, strict=True))
-    for group in groups:
-        numbers = [number[name] for name in group]
-        pycolmap.import_images(importing, copies.folder, pycolmap.CameraMode.SINGLE, numbers)
-    importing.rename(database)
-    replace_file(stamped, stamp)
-    return database
-
-
-def extract(database: Path, photos: PhotoFolder, settings: ReconstructionSettings) -> None:
-    """Extract the features that are missing in the database."""
-    pycolmap = load_pycolmap()
-    with pycolmap.Database.open(database) as db:
-        done = {image.name for image in db.read_all_images() if db.exists_keypoints(image.image_id)}
-    missing = [name for name in photos.names if name not in done]
-    if settings.features == "xfeat":
-        return extract_learned(database, photos.folder, missing, settings.max_size, settings.max_features)
-    options = pycolmap.FeatureExtractionOptions(
-        max_image_size=settings.max_size,
-        num_threads=_threads(_MEMORY_PER_THREAD * (settings.max_size / 1600) ** 2),
-        sift={
-            "max_num_features": settings.max_features,
-            "estimate_affine_shape": settings.features == "dsp-sift",
-            "domain_size_pooling": settings.features == "dsp-sift",
-        },
-    )
-    with progress("features of photos", len(missing)) as advance:
-        for start in range(0, len(missing), _CHUNK_PHOTOS):
-            chunk = missing[start : start + _CHUNK_PHOTOS]
-            pycolmap.extract_features(database, photos.folder, chunk, extraction_options=options)
-            advance(len(chunk))
-
-
-def match(
-    database: Path, names: Sequence[str], settings: ReconstructionSettings, new: Collection[str] | None = None
-) -> None:
-    """Find and verify the matches of pairs that are missing in the database, only those with one of `new`
-    where that is given."""
-    new = set(names if new is None else new)
-    pycolmap = load_pycolmap()
-    with pycolmap.Database.open(database) as db:
-        ids = {image.name: image.image_id for image in db.read_all_images()}
-        known = [n for n in names if n in ids and db.num_keypoints_for_image(ids[n])]
-        learned = LearnedMatcher(database, known) if settings.features == "xfeat" else None
-        read = db.read_descriptors
-        pairs = learned.pairs() if learned else pairs_to_match(known, lambda name: read(ids[name]).data)
-        has = db.exists_matches, db.exists_two_view_geometry
-        wanted = [pair for pair in pairs if not new.isdisjoint(pair)]
-        missing = [(a, b) for a, b in wanted if not all(there(ids[a], ids[b]) for there in has)]
-    guided = settings.features == "dsp-sift"
-    options = pycolmap.FeatureMatchingOptions(num_threads=_threads(5e8), guided_matching=guided)
-    listed = database.with_name("pairs.txt")
-    pairing = pycolmap.ImportedPairingOptions(match_list_path=listed)
-    size = _CHUNK_LEARNED if learned else _CHUNK_PAIRS
-    with progress("pairs of photos", len(missing)) as advance:
-        for start in range(0, len(missing), size):
-            chunk = missing[start : start + size]
-            listed.write_text("".join(f"{a} {b}\n" for a, b in chunk))
-            if learned:
-                learned.match(chunk)
-                pycolmap.verify_matches(database, listed)
-            else:
-                pycolmap.match_image_pairs(database, options, pairing)
-            advance(len(chunk))
 
 
 def _map(
@@ -442,17 +290,6 @@ def write_picture(model: pycolmap.Reconstruction, doubtful: Collection[str], wor
     replace_file(work / PICTURE.name, png.getvalue())
 
 
-def _features_and_partners(database: Path) -> tuple[dict[str, int], Counter[str]]:
-    """Count, for every photo, its features and the photos with which it has verified matches."""
-    pycolmap = load_pycolmap()
-    with pycolmap.Database.open(database) as db:
-        images = {image.image_id: image.name for image in db.read_all_images()}
-        features = {name: db.num_keypoints_for_image(number) for number, name in images.items()}
-        pairs, inliers = db.read_two_view_geometry_num_inliers()
-    matched = (pair for pair, count in zip(pairs, inliers, strict=True) if count >= LEAST_MATCHES)
-    return features, Counter(images[i] for pair in matched for i in pycolmap.pair_id_to_image_pair(pair))
-
-
 def _reasons(
     names: Sequence[str],
     models: list[pycolmap.Reconstruction],
@@ -491,19 +328,3 @@ def _why_no_model(features: Mapping[str, int], partners: Mapping[str, int]) -> s
         f"{len(partners)} of the {len(features)} photos match others, but no two of them start a model: they "
         "seem to be taken from one place, or show a flat picture. Take photos from places a step apart"
     )
-
-
-def _threads(memory_each: float) -> int:
-    """Return the number of cores, limited by half of the machine's memory."""
-    return int(max(1, min(os.cpu_count() or 1, machine_memory() / 2 // memory_each)))
-
-
-@contextmanager
-def quiet() -> Iterator[None]:
-    """Suppress COLMAP's log of thousands of lines; the report contains what matters."""
-    logging = load_pycolmap().logging
-    level, logging.minloglevel = logging.minloglevel, int(logging.FATAL)
-    try:
-        yield
-    finally:
-        logging.minloglevel = level

@@ -25,7 +25,8 @@ from lang3dxl_ns.preparation.regions import _read_labels
 from lang3dxl_ns.preparation.settings import PreparationConfig
 from lang3dxl_ns.scene.colmap import read_reconstruction
 from lang3dxl_ns.scene.companions import companion, inside
-from lang3dxl_ns.scene.photo_folder import extract_frames, find_photos, readable, shared_cameras
+from lang3dxl_ns.scene.photo_folder import find_photos, readable, shared_cameras
+from lang3dxl_ns.scene.video import extract_frames
 
 EPS = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 96 72\n%%EndComments\n(trap) run\n%%EOF\n"
 

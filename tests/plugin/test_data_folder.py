@@ -19,7 +19,7 @@ from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.plugin.datamanager import Lang3DXLDataManagerConfig
 from lang3dxl_ns.plugin.dataparser import PhotoCollectionDataParserConfig, parser_for
 from lang3dxl_ns.scene.layout import images_folder
-from lang3dxl_ns.scene.photo_folder import _looks, _sharpest, extract_frames
+from lang3dxl_ns.scene.video import _looks, _sharpest, extract_frames
 
 needs_ffmpeg = pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="ffmpeg is not installed")
 

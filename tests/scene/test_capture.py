@@ -16,10 +16,10 @@ from lang3dxl_ns.common.pictures import mask_values, open_picture
 from lang3dxl_ns.scene.capture import CaptureSettings, open_capture
 from lang3dxl_ns.scene.colmap import read_reconstruction
 from lang3dxl_ns.scene.frame import Frame, find_frame, lost_cameras
+from lang3dxl_ns.scene.matching import numbered
 from lang3dxl_ns.scene.names import name_finder, resolve
 from lang3dxl_ns.scene.photo_folder import find_photos, readable
 from lang3dxl_ns.scene.ply_points import read_ply_points
-from lang3dxl_ns.scene.reconstruct import numbered
 
 HEIC = (
     b"c-muNV30{GsVvAy%}izhg51nBLl8SRGck>Uf$?~5YDppk1Sn>t<P<^K3<a6VB@Af5Br_);Y>0~k0}}%yh{gCCLIXhqPz(r|v"

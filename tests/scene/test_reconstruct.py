@@ -12,8 +12,10 @@ from scenes import speckled, write_scene
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import locked
+from lang3dxl_ns.scene import matching
 from lang3dxl_ns.scene import reconstruct as module
 from lang3dxl_ns.scene.colmap import read_reconstruction
+from lang3dxl_ns.scene.matching import numbered
 from lang3dxl_ns.scene.photo_folder import find_photos
 from lang3dxl_ns.scene.placements import cameras_of, doubtful_placements, matched_pairs, rotations_of
 from lang3dxl_ns.scene.reconstruct import reconstruct, reconstruct_scene
@@ -246,7 +248,7 @@ def test_a_stopped_reconstruction_goes_on_with_what_it_has(photos, monkeypatch):
 
     monkeypatch.setattr(pycolmap, "extract_features", noted)
     monkeypatch.setattr(pycolmap, "match_image_pairs", stopped)
-    monkeypatch.setattr(module, "_CHUNK_PAIRS", 10)
+    monkeypatch.setattr(matching, "_CHUNK_PAIRS", 10)
     with pytest.raises(KeyboardInterrupt):
         reconstruct_scene(photos, None, SIFT)
     assert not (photos / "sparse").exists()
@@ -269,7 +271,7 @@ def test_photos_in_a_folder_of_that_name_beside_the_work_stay(photos, tmp_path):
     """As with `reconstruct --data castle/reconstruction/photos --cache-dir castle`."""
     own = tmp_path / "reconstruction" / "photos"
     shutil.copytree(photos / "images", own)
-    module.numbered(find_photos(own), own.parent)
+    numbered(find_photos(own), own.parent)
     assert find_photos(own).names == find_photos(photos).names
 
 
