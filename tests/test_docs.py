@@ -8,6 +8,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 README = ROOT / "README.md"
+PACKAGE = ROOT / "lang3dxl_ns"
 USER_PAGES = sorted(path for path in DOCS.glob("*.md") if path.name != "changelog.md")
 LAB_PAGES = sorted((DOCS / "lab").rglob("*.md"))
 PAGES = [README, ROOT / "lab" / "README.md", DOCS / "changelog.md", *USER_PAGES, *LAB_PAGES]
@@ -15,6 +16,7 @@ PAGES = [README, ROOT / "lab" / "README.md", DOCS / "changelog.md", *USER_PAGES,
 DATE = re.compile(r"\b20\d\d-\d\d-\d\d\b")
 COMMAND = re.compile(r"^(?: {4}|`)(?:\w+=\S+ )*(?:lang3dxl|ns-\w+|pytest|python) ", re.MULTILINE)
 LINK = re.compile(r"(?<!`)\]\((?!https?:|mailto:)([^)\s#]*)(?:#([^)\s]*))?\)")
+NAMED_IN_PAGE = re.compile(r"`((?:lang3dxl_ns/|lab/|tests/)?[a-z_]+/[a-z_/]*\.py)`")
 NAMED_IN_CODE = re.compile(r"\bdocs/[\w/]+\.(?:md|png|ipynb)\b")
 CODE = {".py", ".yaml", ".md", ".js", ".html"}
 NOTEBOOK = re.compile(r"\b(?:was|were) tried\b|\bnot tried\b|\bis not kept\b|busy with other work")
@@ -74,6 +76,14 @@ def test_a_laboratory_page_begins_with_date_and_command(page):
 @pytest.mark.parametrize("page", PAGES, ids=name)
 def test_relative_links_resolve(page):
     assert broken_links(page) == []
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if page.name != "changelog.md"], ids=name)
+def test_the_code_that_a_page_names_is_there(page):
+    named = NAMED_IN_PAGE.findall(page.read_text())
+    assert [
+        path for path in named if not any((at / path).is_file() for at in (ROOT, PACKAGE, page.parent))
+    ] == []
 
 
 def test_a_link_to_no_page_or_heading_is_found(tmp_path):
