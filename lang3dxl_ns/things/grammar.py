@@ -47,15 +47,20 @@ class Request:
     along: str | None = None
     """Side from which things are numbered."""
     relation: str | None = None
-    others: tuple[str, ...] = ()
-    """Prompts of the things that the relation refers to."""
+    others: tuple[Request, ...] = ()
+    """What the relation refers to: *the portal*, *the highest tower*."""
     without: str | None = None
     """Prompt of things that are left out."""
 
     @property
+    def parts(self) -> list[Request]:
+        """The request and those that its relation refers to, all the way down."""
+        return [self, *(part for other in self.others for part in other.parts)]
+
+    @property
     def words(self) -> list[str]:
         """All prompts, each once."""
-        return list(dict.fromkeys([self.word, *self.others, *([self.without] if self.without else [])]))
+        return list(dict.fromkeys(w for part in self.parts for w in (part.word, part.without) if w))
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,13 +96,18 @@ def parse(text: str) -> Request:
     count, rest = _taken(rest, words["count"])
     _, rest = _taken(rest, words["lead"])
     rest = re.sub(rf"\s+({_any(words['tail'])})$", "", rest)
-    without, relation, others = None, None, tuple[str, ...]()
+    return replace(_request(rest), count=count)
+
+
+def _request(rest: str) -> Request:
+    words = table()
+    without, relation, others = None, None, tuple[Request, ...]()
     if found := re.fullmatch(r"(.+?) (?:but )?not (.+)", rest):
         rest, without = found[1], _plain(found[2])
     found = re.fullmatch(rf"(.+?) ({_any(words['relations'])}) (.+)", rest)
     if found and _plain(found[3]) not in words["from"]:  # *on the left* names no thing
         rest, relation = found[1], words["relations"][found[2]]
-        others = tuple(_plain(part) for part in re.split(r"\s+and\s+", found[3]))
+        others = tuple(_request(part) for part in re.split(r"\s+and\s+", found[3]))
         if len(others) > (2 if relation == "between" else 1):
             raise UserError(f"{found[2]} {found[3]}: name one thing, or two with between … and …")
     along, nth, superlative = None, None, None
@@ -105,7 +115,7 @@ def parse(text: str) -> Request:
         rest, along = found[1], found[2]
     rest = _plain(rest)
     first, _, noun = rest.partition(" ")
-    if noun and first in words["superlatives"]:
+    if noun and first in words["superlatives"] and not noun.startswith("of "):
         superlative, rest = first, noun
     elif noun and (first in words["ordinals"] or re.fullmatch(r"\d+(st|nd|rd|th)", first)):
         nth, rest = words["ordinals"].get(first) or int(first[:-2]), noun
@@ -113,9 +123,9 @@ def parse(text: str) -> Request:
             raise UserError(f"{first} {noun}: say from which side, such as the {first} {noun} from the left")
     if along is not None and nth is None:
         raise UserError(f"from the {along}: say which one, such as the second {rest} from the {along}")
-    for name in (rest, *others, *([] if without is None else [without])):
+    for name in (rest, *([] if without is None else [without])):
         _check_name(name)
-    return Request(rest, count, superlative, nth, along, relation, others, without)
+    return Request(rest, False, superlative, nth, along, relation, others, without)
 
 
 def _check_name(name: str) -> None:
@@ -145,10 +155,9 @@ def answer(request: Request, found: Sequence[Things], sight: Facing) -> list[Thi
         chosen = [thing for thing in chosen if thing.id not in gone]
     view = sight(chosen or [thing for listed in things.values() for thing in listed])
     if request.relation:
-        for word in request.others:
-            if not things[word]:
-                raise UserError(f"no {word} found: a relation to it has no answer")
-        others = [things[word] for word in request.others]
+        others = [answer(other, found, sight) for other in request.others]
+        if missing := [other.word for other, there in zip(request.others, others, strict=True) if not there]:
+            raise UserError(f"no {missing[0]} found: a relation to it has no answer")
         chosen = [t for t in chosen if _related(t, request.relation, others, view)]
     if request.superlative:
         kind, sign = table()["superlatives"][request.superlative]
@@ -175,7 +184,8 @@ def unsure(request: Request, found: Sequence[Things], sight: Facing) -> str | No
         each = [[replace(other, things=some) if other is one else other for other in found] for some in ways]
         if len({_told(request, listed, sight) for listed in each}) > 1:
             wide.append(f"{one.word}: {one.count}")
-    return ", ".join(wide) or _close(request, found, sight)
+    close = (_close(part, found, sight) for part in request.parts)
+    return ", ".join(wide) or next(filter(None, close), None)
 
 
 def _told(request: Request, found: Sequence[Things], sight: Facing) -> int | frozenset[int] | None:

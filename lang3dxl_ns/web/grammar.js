@@ -7,33 +7,37 @@ const has = (table, word) => Object.hasOwn(table, word);
 const any = (phrases) => [...(Array.isArray(phrases) ? phrases : Object.keys(phrases))].sort((a, b) => b.length - a.length).join("|");
 const plain = (text) => text.trim().replace(new RegExp(`^(?:(?:${any(grammar.articles)})\\s+)+`), "");
 
-/** Parse a question: { word, count, superlative, nth, along, relation, others, without }. Throws an error, which names
- * the part, for what the grammar doesn't know. */
+/** Parse a question: { word, count, superlative, nth, along, relation, others: what it refers to, without }. Throws an
+ * error, which names the part, for what the grammar doesn't know. */
 export function parse(text) {
   let rest = text.toLowerCase().replace(/^[ ?!.]+|[ ?!.]+$/g, "").split(/\s+/).filter(Boolean).join(" ");
-  const asked = { word: "", count: false, superlative: null, nth: null, along: null, relation: null, others: [], without: null };
   const cut = (pattern) => rest !== (rest = rest.replace(pattern, ""));
-  asked.count = cut(new RegExp(`^(?:${any(grammar.count)})\\s+`));
+  const count = cut(new RegExp(`^(?:${any(grammar.count)})\\s+`));
   cut(new RegExp(`^(?:${any(grammar.lead)})\\s+`));
   cut(new RegExp(`\\s+(?:${any(grammar.tail)})$`));
+  return { ...request(rest), count };
+}
+
+function request(rest) {
+  const asked = { word: "", count: false, superlative: null, nth: null, along: null, relation: null, others: [], without: null };
   let found = /^(.+?) (?:but )?not (.+)$/.exec(rest);
   if (found) [rest, asked.without] = [found[1], plain(found[2])];
   found = new RegExp(`^(.+?) (${any(grammar.relations)}) (.+)$`).exec(rest);
   if (found && !has(grammar.from, plain(found[3]))) {
-    [rest, asked.relation, asked.others] = [found[1], grammar.relations[found[2]], found[3].split(/\s+and\s+/).map(plain)];
+    [rest, asked.relation, asked.others] = [found[1], grammar.relations[found[2]], found[3].split(/\s+and\s+/).map(request)];
     if (asked.others.length > (asked.relation === "between" ? 2 : 1)) throw new Error(`${found[2]} ${found[3]}: name one thing, or two with between … and …`);
   }
   found = new RegExp(`^(.+?) (?:from|on) the (${any(grammar.from)})$`).exec(rest);
   if (found) [rest, asked.along] = [found[1], found[2]];
   rest = plain(rest);
   const [, first, noun] = /^(\S+) (.+)$/.exec(rest) ?? [];
-  if (noun && has(grammar.superlatives, first)) [asked.superlative, rest] = [first, noun];
+  if (noun && has(grammar.superlatives, first) && !noun.startsWith("of ")) [asked.superlative, rest] = [first, noun];
   else if (noun && (has(grammar.ordinals, first) || /^\d+(st|nd|rd|th)$/.test(first))) {
     [asked.nth, rest] = [grammar.ordinals[first] ?? parseInt(first), noun];
     if (!asked.along || asked.nth < 1) throw new Error(`${first} ${noun}: say from which side, such as the ${first} ${noun} from the left`);
   }
   if (asked.along && !asked.nth) throw new Error(`from the ${asked.along}: say which one, such as the second ${rest} from the ${asked.along}`);
-  for (const name of [rest, ...asked.others, ...(asked.without === null ? [] : [asked.without])]) checkName(name);
+  for (const name of [rest, ...(asked.without === null ? [] : [asked.without])]) checkName(name);
   return { ...asked, word: rest };
 }
 
@@ -57,7 +61,8 @@ export function isQuestion(text) {
   }
 }
 
-export const wordsOf = ({ word, others, without }) => [...new Set([word, ...others, ...(without ? [without] : [])])];
+const partsOf = (request) => [request, ...request.others.flatMap(partsOf)];
+export const wordsOf = (request) => [...new Set(partsOf(request).flatMap(({ word, without }) => (without ? [word, without] : [word])))];
 
 /** Choose the things that a request asks for. things: those of each word; view: { right, up, ahead }. Throws an error if
  * a thing that the relation refers to is not found, or if there are fewer than the ordinal asks for. */
@@ -66,8 +71,9 @@ export function answerTo(request, things, view) {
   let chosen = things[word];
   if (without) chosen = chosen.filter(({ id }) => !things[without].some((other) => other.id === id));
   if (relation) {
-    for (const other of others) if (!things[other].length) throw new Error(`no ${other} found: a relation to it has no answer`);
-    chosen = chosen.filter((thing) => related(thing, relation, others.map((other) => things[other]), view)); // prettier-ignore
+    const there = others.map((other) => answerTo(other, things, view)), missing = there.findIndex((some) => !some.length);
+    if (missing >= 0) throw new Error(`no ${others[missing].word} found: a relation to it has no answer`);
+    chosen = chosen.filter((thing) => related(thing, relation, there, view));
   }
   const ordered = ([kind, sign]) => [...chosen].sort((a, b) => sign * (measure(a, kind, view) - measure(b, kind, view)));
   if (superlative) return ordered(grammar.superlatives[superlative]).slice(0, 1);
@@ -105,11 +111,13 @@ export function unsure(request, found, view, shown = (word) => word) {
     return new Set([things, sureOf(things), [...things, ...candidates]].map((some) => told({ [word]: some }))).size > 1;
   });
   if (wide.length) return wide.map((word) => `${shown(word)}: ${count(found[word])}`).join(", ");
-  const [kind, sign] = grammar.superlatives[request.superlative] ?? ["left", 1];
-  if (kind === "left" || kind === "top" || told({}) === null) return null;
-  const sizes = answerTo({ ...request, superlative: null }, of({}), view).map((thing) => measure(thing, kind, view)).sort((a, b) => sign * (a - b));
-  const close = sizes.length > 1 && Math.max(sizes[0], sizes[1]) < CLOSE * Math.min(sizes[0], sizes[1]);
-  return close ? `another ${shown(request.word)} measures nearly the same` : null;
+  for (const part of told({}) === null ? [] : partsOf(request)) {
+    const [kind, sign] = grammar.superlatives[part.superlative] ?? ["left", 1];
+    if (kind === "left" || kind === "top") continue;
+    const sizes = answerTo({ ...part, superlative: null }, of({}), view).map((thing) => measure(thing, kind, view)).sort((a, b) => sign * (a - b));
+    if (sizes.length > 1 && Math.max(sizes[0], sizes[1]) < CLOSE * Math.min(sizes[0], sizes[1])) return `another ${shown(part.word)} measures nearly the same`;
+  }
+  return null;
 }
 
 const minus = (a, b) => a.map((value, axis) => value - b[axis]);

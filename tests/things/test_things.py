@@ -173,13 +173,24 @@ def test_boxes_stand_along_the_walls(angle):
         ("highest tower", Request("tower", superlative="highest")),
         ("the third window from the left", Request("window", nth=3, along="left")),
         ("third window on the left", Request("window", nth=3, along="left")),
-        ("windows left of the portal", Request("windows", relation="left", others=("portal",))),
-        ("the window between the portals", Request("window", relation="between", others=("portals",))),
+        ("windows left of the portal", Request("windows", relation="left", others=(Request("portal"),))),
+        (
+            "the window between the portals",
+            Request("window", relation="between", others=(Request("portals"),)),
+        ),
         ("count windows not doors", Request("windows", count=True, without="doors")),
         ("rose window", Request("rose window")),
         (
             "largest window above the portal",
-            Request("window", superlative="largest", relation="above", others=("portal",)),
+            Request("window", superlative="largest", relation="above", others=(Request("portal"),)),
+        ),
+        (
+            "how many windows on the left tower",
+            Request("windows", True, relation="in", others=(Request("tower", superlative="left"),)),
+        ),
+        (
+            "windows above the second door from the left",
+            Request("windows", relation="above", others=(Request("door", nth=2, along="left"),)),
         ),
     ],
 )
@@ -188,7 +199,11 @@ def test_questions_are_read(text, request_):
 
 
 @pytest.mark.parametrize(
-    "text", ["third window", "windows from the left", "windows between the a and b and c", ""]
+    "text",
+    [
+        *("third window", "windows from the left", "windows between the a and b and c", ""),
+        *("left of the door", "windows on the second tower", "windows on"),
+    ],
 )
 def test_what_the_grammar_does_not_know_is_said(text):
     with pytest.raises(UserError):
@@ -210,6 +225,9 @@ def test_questions_choose_by_place_and_size_and_mirror_with_the_viewer():
     assert ids("window left of the portal") == ids("window right of the portal", mirrored) == [0, 1]
     assert ids("window above the portal") == [0, 1, 2, 3]
     assert ids("window below the portal") == []
+    assert ids("portal below the leftmost window") == ids("portal left of the rightmost window") == [9]
+    assert ids("portal left of the leftmost window") == []
+    assert ids("window left of the right window") == [0, 1, 3]
     with pytest.raises(UserError, match="only 4"):
         ids("fifth window from the left")
 
@@ -373,6 +391,8 @@ def test_an_answer_has_a_caution_if_doubt_would_change_it():
     assert caution("window above the portal", windows, [perhaps])
     assert caution("window below the portal", windows, [perhaps]) is None
     assert caution("largest window", windows) is None
+    assert caution("portal below the largest window", windows) is None
+    assert caution("portal below the largest window", [*windows, thing(4, "window", (0, 0, 0), (6, 1, 7), 9)])
     assert caution("largest window", [*windows, thing(4, "window", (0, 0, 0), (6, 1, 7), views=9)])
     assert caution("highest window", [*windows, thing(4, "window", (0, 0, 0), (6, 1, 7), views=9)]) is None
 
