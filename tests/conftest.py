@@ -18,13 +18,13 @@ import inspect
 import os
 import sys
 from collections import Counter
-from copy import deepcopy
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
 import torch
+from runs import make_trainer
 from scenes import write_scene
 from tiny_models import make_tiny_clip, make_tiny_dinov2
 
@@ -139,21 +139,6 @@ def two_steps(tmp_path_factory, tiny_clip, tiny_dense):
     return trainer
 
 
-def fitted(data: Path, clip: Path, dense: Path, out: Path, steps: int = 2):
-    """A finished `fit.Run`, without nerfstudio, with a small sky and few steps of learning codes."""
-    from lang3dxl_ns.common.stages import Stages
-    from lang3dxl_ns.scene.capture import open_capture
-    from lang3dxl_ns.training.fit import Settings, begin
-
-    settings = Settings.of("lang3dxl", steps)
-    settings.targets.clip, settings.targets.dense = str(clip), str(dense)
-    settings.scene.sky_gaussians, settings.scene.semantic_field.code_dim = 50, 3
-    settings.scene.decoder.compression.steps = 20
-    run = begin(open_capture(data), settings, out, data / "lang3dxl_cache", "cpu")
-    run.complete(Stages({"train": 1.0, "words": 1.0}))
-    return run
-
-
 @pytest.fixture
 def train(tiny_clip, tiny_dense, tmp_path):
     """Train like `ns-train lang3dxl`, in this process; returns the trainer."""
@@ -166,33 +151,6 @@ def train(tiny_clip, tiny_dense, tmp_path):
         return trainer
 
     return run
-
-
-def make_trainer(data, clip, dense, output_dir, iterations, semantics=True, method="lang3dxl", **changes):
-    """A trainer of a registered method, configured as the command line would."""
-    from lang3dxl_ns.methods import METHODS
-
-    config = deepcopy(METHODS[method].config)
-    config.data = config.pipeline.datamanager.data = data
-    config.output_dir, config.vis, config.max_num_iterations = output_dir, "tensorboard", iterations
-    config.pipeline.datamanager.clip = str(clip) if semantics else "none"
-    config.pipeline.datamanager.dense = str(dense) if semantics else "none"
-    config.viewer.quit_on_train_completion = True
-    config.pipeline.model.sky_gaussians = 400
-    compression = config.pipeline.model.decoder.compression
-    compression.steps, compression.batch = 20, 512
-    config.pipeline.model.semantic_field.code_dim = 3
-    for path, value in changes.items():
-        *owners, name = path.split("__")
-        owner = config
-        for part in owners:
-            owner = getattr(owner, part)
-        assert hasattr(owner, name), path
-        setattr(owner, name, value)
-    torch.manual_seed(config.machine.seed)
-    config.set_timestamp()
-    config.save_config()
-    return config.setup(local_rank=0, world_size=1)
 
 
 @pytest.fixture(scope="session")

@@ -34,7 +34,7 @@ def on_eight_threads() -> None:
 
 
 def of_large_photos(folder, clip, dense) -> None:
-    from conftest import make_trainer
+    from runs import make_trainer
     from scenes import write_scene
 
     data = write_scene(folder / "scene", photos=3, points=200, size=(4000, 3000), coarseness=4)

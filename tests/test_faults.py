@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 import torch
 import yaml
-from conftest import make_trainer
 from PIL import Image
+from runs import make_trainer
 from scenes import write_scene
 
 from lang3dxl_ns.common.errors import UserError

@@ -11,8 +11,8 @@ from importlib import import_module
 
 import pytest
 import torch
-from conftest import make_trainer
 from fake_gpu import CUDA, GpuTensor, fake_gpu, real_gpu
+from runs import make_trainer
 from scenes import write_scene
 
 from lab.baselines import BASELINES, langsplat

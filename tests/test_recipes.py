@@ -5,9 +5,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import fitted
 from painted_scene import DISTANCE, DOME, painted_gaussians, painted_scene
 from PIL import Image
+from runs import fitted
 
 import lang3dxl_ns.open_scene as opening
 

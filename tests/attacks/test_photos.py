@@ -9,8 +9,8 @@ import subprocess
 import numpy as np
 import pycolmap
 import pytest
-from conftest import make_trainer
 from PIL import Image
+from runs import make_trainer
 from scenes import write_scene
 
 from lang3dxl_ns import cli

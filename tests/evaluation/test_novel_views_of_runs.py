@@ -6,9 +6,9 @@ import shutil
 import numpy as np
 import pytest
 import torch
-from conftest import fitted
 from label_sets import write_plain
 from PIL import Image
+from runs import fitted
 
 from lab.landmark.demo_scene import FOLDER
 from lab.landmark.novel_views import read_novel_views

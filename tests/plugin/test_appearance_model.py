@@ -4,9 +4,9 @@ from copy import deepcopy
 
 import pytest
 import torch
-from conftest import make_trainer
 from looks import in_look
 from nerfstudio.utils.eval_utils import eval_setup
+from runs import make_trainer
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.plugin.model import Lang3DXLModel

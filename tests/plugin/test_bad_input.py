@@ -4,9 +4,9 @@ import shutil
 from pathlib import Path
 
 import pytest
-from conftest import make_trainer
 from PIL import Image
 from processes import Process
+from runs import make_trainer
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.plugin.pipeline import print_user_errors_plainly

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from conftest import make_trainer
+from runs import make_trainer
 
 from lang3dxl_ns.files.read_splats import read_splats
 from lang3dxl_ns.files.splat_file import write_splats

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from conftest import make_trainer
+from runs import make_trainer
 from scenes import write_scene
 
 from lang3dxl_ns.common.errors import UserError

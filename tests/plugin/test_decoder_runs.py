@@ -4,8 +4,8 @@ from functools import cache
 
 import pytest
 import torch
-from conftest import make_trainer
 from nerfstudio.utils.eval_utils import eval_setup
+from runs import make_trainer
 
 from lab.baselines import BASELINES, langsplat
 from lang3dxl_ns.components.compression import CompressionConfig

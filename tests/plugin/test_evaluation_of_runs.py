@@ -6,9 +6,9 @@ import shutil
 import numpy as np
 import pytest
 import torch
-from conftest import make_trainer
 from label_sets import box_object, write_labels, write_plain
 from PIL import Image
+from runs import make_trainer
 from scenes import write_scene
 
 from lang3dxl_ns import cli

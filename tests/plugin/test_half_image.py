@@ -2,8 +2,8 @@
 
 import pytest
 import torch
-from conftest import make_trainer
 from looks import in_look
+from runs import make_trainer
 
 from lang3dxl_ns.components.appearance import Look
 from lang3dxl_ns.components.losses import rgb_loss

@@ -9,9 +9,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from conftest import make_trainer
 from PIL import Image
 from plyfile import PlyData
+from runs import make_trainer
 from scenes import view_of, write_scene
 from tiny_models import make_tiny_clip
 

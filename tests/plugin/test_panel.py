@@ -9,11 +9,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from conftest import make_trainer
 from idle_worker import idle
 from nerfstudio.configs.base_config import ViewerConfig
 from nerfstudio.utils.eval_utils import eval_setup
 from nerfstudio.viewer.viewer import Viewer
+from runs import make_trainer
 from scenes import view_of, write_scene
 
 from lang3dxl_ns.plugin.panel import INVITATION, stand_of

@@ -4,7 +4,7 @@ from copy import deepcopy
 
 import pytest
 import torch
-from conftest import make_trainer
+from runs import make_trainer
 
 import lab.baselines  # noqa: F401, which registers fmgs
 from lang3dxl_ns.common.errors import UserError

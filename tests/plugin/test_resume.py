@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from conftest import make_trainer
+from runs import make_trainer
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.open_scene import load_scene

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from conftest import make_trainer
 from fake_gpu import fake_gpu
+from runs import make_trainer
 from scenes import write_scene
 from tiny_models import make_tiny_clip
 from tiny_teachers import TEACHERS

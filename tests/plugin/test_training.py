@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 import torch
-from conftest import make_trainer
 from nerfstudio.cameras.cameras import CameraType
 from nerfstudio.utils.eval_utils import eval_setup
 from PIL import Image
+from runs import make_trainer
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.plugin.trainer import Lang3DXLTrainer

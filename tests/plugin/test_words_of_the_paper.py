@@ -1,7 +1,7 @@
 """The paper's method finds words."""
 
 import pytest
-from conftest import make_trainer
+from runs import make_trainer
 
 from lab.landmark.demo_scene import DemoScene
 from lab.landmark.novel_views_of_runs import evaluate_novel_views

@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from conftest import make_trainer
 from PIL import Image
+from runs import make_trainer
 
 from lab.landmark.scene_writer import DemoScene, write_scene
 from lang3dxl_ns.common.errors import UserError

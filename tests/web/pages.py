@@ -2,7 +2,6 @@
 
 import io
 import json
-import shutil
 import threading
 from contextlib import contextmanager
 from dataclasses import replace
@@ -10,7 +9,6 @@ from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 
 import numpy as np
-import pytest
 import torch
 import torch.nn.functional as F
 from painted_scene import (
@@ -23,11 +21,6 @@ from PIL import Image
 
 from lang3dxl_ns.components.compression import CompressedField
 from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
-from lang3dxl_ns.files.scene_file import Provenance
-from lang3dxl_ns.web.write_page import Page, write_page
-
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-
 
 SWITCHES = [
     *("--headless", "--no-sandbox", "--disable-background-networking", "--disable-component-update"),
@@ -120,33 +113,10 @@ def served(folder):
     server.server_close()
 
 
-@pytest.fixture(scope="module")
-def browser():
-    sync_api = pytest.importorskip("playwright.sync_api", reason="install the [test] extra for playwright")
-    if CHROMIUM is None:
-        pytest.skip("there is no chromium: apt install chromium")
-    with sync_api.sync_playwright() as p:
-        browser = p.chromium.launch(executable_path=CHROMIUM, args=SWITCHES)
-        yield browser
-        browser.close()
-
-
-@pytest.fixture(scope="module")
-def scene():
-    return painted_scene()
-
-
-@pytest.fixture(scope="module")
-def address(scene, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("page")
-    write_page(Page(scene, more=WORDS, provenance=Provenance(HOSTILE, "Painted by nobody", "CC0")), folder)
-    with served(folder) as address:
-        yield address
-
-
 def opened(browser, address, viewport):
     """A page that is ready, with what it complained about or fetched from elsewhere."""
-    page = browser.new_page(viewport=viewport)
+    page = browser.contexts[0].new_page()  # a profile, which keeps compiled scripts and shaders
+    page.set_viewport_size(viewport)
     page.set_default_timeout(240_000)
     page.complaints = []
     page.on("console", lambda m: page.complaints.append(m.text) if m.type != "log" else None)
@@ -156,29 +126,6 @@ def opened(browser, address, viewport):
     page.goto(address)
     page.evaluate("lang3dxl.ready.then(() => true)")
     return page
-
-
-@pytest.fixture(scope="module")
-def desk(browser, address):
-    page = opened(browser, address, DESK)
-    yield page
-    assert page.complaints == []
-
-
-@pytest.fixture
-def page(desk):
-    """The page, without prompts, where the overview's photo was taken."""
-    for _ in range(4):  # whatever is open
-        desk.locator("#frame").press("Escape")
-    desk.evaluate("lang3dxl.clear()")
-    desk.evaluate("Object.assign(lang3dxl.view.mover, { free: false, shift: false })")
-    desk.evaluate("document.getElementById('free').checked = false")
-    desk.emulate_media(reduced_motion="reduce")  # no second of flight
-    desk.get_by_role("button", name="Overview").click()
-    desk.evaluate(STAND)
-    rest(desk)
-    desk.emulate_media(reduced_motion="no-preference")
-    return desk
 
 
 STAND = "(({ mover, about }) => mover.jump(mover.standing(about.start)))(lang3dxl.view)"

@@ -6,10 +6,8 @@ from functools import partial
 import numpy as np
 import pytest
 import torch
-from pages import THINK, WORDS, browser, camera_of_page, field_scene, scene, served, tilted_scene
-from painted_scene import (
-    painted_scene,
-)
+from pages import THINK, WORDS, camera_of_page, field_scene, served, tilted_scene
+from painted_scene import painted_scene
 
 from lang3dxl_ns.query.doubt import LEAST_PEAK, peaks
 from lang3dxl_ns.query.question import QueryConfig

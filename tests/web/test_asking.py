@@ -7,25 +7,16 @@ from pages import (
     HOSTILE,
     PHONE,
     SIDE,
-    address,
-    browser,
     cells,
-    desk,
     opened,
-    page,
     picture,
     prompts_of,
-    rest,
-    scene,
     served,
     until,
     until_linked,
     until_told,
 )
-from painted_scene import (
-    painted_looks,
-    painted_scene,
-)
+from painted_scene import painted_looks, painted_scene
 from PIL import Image
 
 from lang3dxl_ns.web.write_page import Page, write_page

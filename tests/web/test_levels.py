@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 import torch.nn.functional as F
-from pages import DESK, STAND, browser, opened, picture, served
+from pages import DESK, STAND, opened, picture, served
 from painted_scene import painted_looks, painted_scene, painted_splats
 
 from lang3dxl_ns.rendering import Splats, render

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from pages import DESK, browser, opened, rest, served, until, until_linked, until_told
+from pages import DESK, opened, rest, served, until, until_linked, until_told
 from painted_scene import CHANNELS, encode_texts, painted_file, painted_scene
 from PIL import Image
 

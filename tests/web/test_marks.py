@@ -3,7 +3,7 @@
 import json
 
 import numpy as np
-from pages import THINK, browser, camera_of_page, served, tilted_scene
+from pages import THINK, camera_of_page, served, tilted_scene
 
 from lang3dxl_ns.web.write_page import Page, write_page
 

@@ -4,7 +4,7 @@ import re
 from dataclasses import replace
 
 import numpy as np
-from pages import DESK, browser, opened, served, until_linked, until_told
+from pages import DESK, opened, served, until_linked, until_told
 from painted_scene import painted_file, painted_scene
 
 from lang3dxl_ns.scene.georeference import Georeference

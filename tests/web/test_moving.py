@@ -5,27 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from pages import (
-    DESK,
-    PHONE,
-    PRESS,
-    SIDE,
-    address,
-    browser,
-    desk,
-    opened,
-    page,
-    picture,
-    rest,
-    scene,
-    served,
-    until,
-    until_told,
-)
-from painted_scene import (
-    painted_file,
-    painted_scene,
-)
+from pages import DESK, PHONE, PRESS, SIDE, opened, picture, rest, served, until, until_told
+from painted_scene import painted_file, painted_scene
 
 from lang3dxl_ns.web.write_page import Page, write_page
 

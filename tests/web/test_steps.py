@@ -2,20 +2,7 @@
 
 import numpy as np
 import pytest
-from pages import (
-    DESK,
-    SIDE,
-    address,
-    browser,
-    desk,
-    opened,
-    page,
-    picture,
-    prompts_of,
-    scene,
-    until,
-    until_linked,
-)
+from pages import DESK, SIDE, opened, picture, prompts_of, until, until_linked
 
 
 @pytest.mark.slow

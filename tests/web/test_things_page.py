@@ -5,7 +5,7 @@ from dataclasses import asdict
 
 import numpy as np
 import pytest
-from pages import DESK, browser, opened, served, until, until_linked
+from pages import DESK, opened, served, until, until_linked
 from painted_scene import painted_scene
 
 from lang3dxl_ns.common.errors import UserError

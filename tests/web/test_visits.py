@@ -6,7 +6,7 @@ import tarfile
 from contextlib import contextmanager
 
 import pytest
-from pages import PHONE, browser, prompts_of, served, until
+from pages import PHONE, prompts_of, served, until
 from painted_scene import painted_scene
 from PIL import Image
 

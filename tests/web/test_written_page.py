@@ -8,12 +8,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from pages import field_scene, scene
-from painted_scene import (
-    painted_looks,
-    painted_scene,
-    painted_splats,
-)
+from pages import field_scene
+from painted_scene import painted_looks, painted_scene, painted_splats
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import read_names
