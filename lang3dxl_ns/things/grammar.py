@@ -90,7 +90,8 @@ def parse(text: str) -> Request:
     rest = " ".join(text.lower().strip(" ?!.").split())
     count, rest = _taken(rest, words["count"])
     _, rest = _taken(rest, words["lead"])
-    rest = re.sub(rf"\s+({_any(words['tail'])})$", "", rest)
+    idle = rf" (?:that |which )?(?:are|is)(?= (?:{_any(words['relations'])}) )| (?:{_any(words['tail'])})$"
+    rest = re.sub(idle, "", rest)
     without, relation, others = None, None, tuple[str, ...]()
     if found := re.fullmatch(r"(.+?) (?:but )?not (.+)", rest):
         rest, without = found[1], _plain(found[2])
@@ -168,7 +169,6 @@ def unsure(request: Request, found: Sequence[Things], sight: Facing) -> str | No
     The answer has to be the same without the things that few photos show, and with all candidates. Sizes are
     known roughly: where the next thing is nearly as large, either may be the largest.
     """
-
     wide = []
     for one in (one for one in found if one.word in request.words):
         ways = (one.things, one.sure, [*one.things, *one.candidates])

@@ -15,7 +15,7 @@ export function parse(text) {
   const cut = (pattern) => rest !== (rest = rest.replace(pattern, ""));
   asked.count = cut(new RegExp(`^(?:${any(grammar.count)})\\s+`));
   cut(new RegExp(`^(?:${any(grammar.lead)})\\s+`));
-  cut(new RegExp(`\\s+(?:${any(grammar.tail)})$`));
+  cut(new RegExp(` (?:that |which )?(?:are|is)(?= (?:${any(grammar.relations)}) )| (?:${any(grammar.tail)})$`, "g"));
   let found = /^(.+?) (?:but )?not (.+)$/.exec(rest);
   if (found) [rest, asked.without] = [found[1], plain(found[2])];
   found = new RegExp(`^(.+?) (${any(grammar.relations)}) (.+)$`).exec(rest);
@@ -53,7 +53,7 @@ export function isQuestion(text) {
     const { count, superlative, nth, relation } = parse(text);
     return Boolean(count || superlative || nth || relation);
   } catch {
-    return new RegExp(`^(?:${any(grammar.count)}|what|which|why|who|when)\\s`, "i").test(text.trim()); // the grammar says why it has no answer
+    return new RegExp(`^(?:${any(grammar.count)}|how|what|which|why|who|when)\\s`, "i").test(text.trim()); // the grammar says why it has no answer
   }
 }
 
