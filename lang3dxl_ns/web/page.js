@@ -8,7 +8,7 @@ import { List } from "./list.js";
 import { distanceAsText, drawScale, heightAsText, inShares, setLength } from "./measure.js";
 import { Photos } from "./photos.js";
 import { areExamples, asPython, drawOutline, examplesAsText, examplesFromText, inside, rounded, UNNAMED, wordsFile } from "./teach.js";
-import { fetched, thinker } from "./think.js";
+import { fetched, request, thinker } from "./think.js";
 import { Tour } from "./tour.js";
 import { parsePrompts, tidy } from "./vocabulary.js";
 import { View } from "./view.js";
@@ -313,7 +313,7 @@ async function outline(prompt) {
   if (found) await attempt(() => addMark(prompt, inside(found), prompt.without, found));
 }
 
-const post = (path, content) => fetch(path, { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(content) });
+const post = (path, content) => request(path, { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(content) });
 
 /** Keep the tour in the address and, behind a live page, in the scene's file. */
 async function keepTour() {

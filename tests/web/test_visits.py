@@ -227,3 +227,5 @@ def test_axe_finds_nothing(browser, address, axe, size):
         page.locator("#strip button").first.click()
         until(page, "document.getElementById('over').hidden", False)
         assert page.evaluate(run) == []
+        page.get_by_role("button", name="Panel").click()
+        assert page.locator("#status").is_visible() and page.evaluate(run) == []
