@@ -95,8 +95,11 @@ def parse(text: str) -> Request:
     rest = " ".join(text.lower().strip(" ?!.").split())
     count, rest = _taken(rest, words["count"])
     _, rest = _taken(rest, words["lead"])
-    rest = re.sub(rf"\s+({_any(words['tail'])})$", "", rest)
-    return replace(_request(rest), count=count)
+    idle = (
+        rf" (?:that |which )?(?:are|is)(?: there)?(?= (?:{_any(words['relations'])}) )"
+        rf"| (?:{_any(words['tail'])})$"
+    )
+    return replace(_request(re.sub(idle, "", rest)), count=count)
 
 
 def _request(rest: str) -> Request:
@@ -177,7 +180,6 @@ def unsure(request: Request, found: Sequence[Things], sight: Facing) -> str | No
     The answer has to be the same without the things that few photos show, and with all candidates. Sizes are
     known roughly: where the next thing is nearly as large, either may be the largest.
     """
-
     wide = []
     for one in (one for one in found if one.word in request.words):
         ways = (one.things, one.sure, [*one.things, *one.candidates])

@@ -14,7 +14,12 @@ export function element(tag, properties = {}, ...children) {
 
 /** Create a small button. */
 export const small = (label, onclick, more = {}) => element("button", { className: "small", onclick, ...more }, label);
-export const say = (message) => ($("status").textContent = message);
+
+/** Tell something; usual: what is told while nothing has happened, which a folded panel hides. */
+export function say(message, usual = false) {
+  $("status").textContent = message;
+  $("status").classList.toggle("usual", usual);
+}
 
 /** Say what can be asked. known: the words that the page answers, once it has read what the scene means. */
 export function explain({ count, detail, known, live, words, foreground }) {
@@ -63,7 +68,7 @@ export function promptCard(prompt, { fly, remove, rename, dragThreshold, setThre
     without.disabled = !examples.length;
     parts.push(
       element("div", { className: "teach" }, without, button("Outline", outline), ...(prompt.named ? [button("Save", save), button("Forget", forget)] : [])),
-      element("p", { className: "hint" }, examples.length ? prompt.told ?? "" : "Click on it in the view, or outline it. Then give it a name.")); // prettier-ignore
+      element("p", { className: "hint" }, prompt.told ?? "")); // prettier-ignore
   }
   if (threshold != null) {
     const slider = element("input", { type: "range", min: 0, max: 1, step: 0.01, value: threshold, ariaLabel: `Threshold of ${shown(text)}` });

@@ -14,7 +14,7 @@ export function parse(text) {
   const cut = (pattern) => rest !== (rest = rest.replace(pattern, ""));
   const count = cut(new RegExp(`^(?:${any(grammar.count)})\\s+`));
   cut(new RegExp(`^(?:${any(grammar.lead)})\\s+`));
-  cut(new RegExp(`\\s+(?:${any(grammar.tail)})$`));
+  cut(new RegExp(` (?:that |which )?(?:are|is)(?: there)?(?= (?:${any(grammar.relations)}) )| (?:${any(grammar.tail)})$`, "g"));
   return { ...request(rest), count };
 }
 
@@ -57,7 +57,7 @@ export function isQuestion(text) {
     const { count, superlative, nth, relation } = parse(text);
     return Boolean(count || superlative || nth || relation);
   } catch {
-    return new RegExp(`^(?:${any(grammar.count)}|what|which|why|who|when)\\s`, "i").test(text.trim()); // the grammar says why it has no answer
+    return new RegExp(`^(?:${any(grammar.count)}|how|what|which|why|who|when)\\s`, "i").test(text.trim()); // the grammar says why it has no answer
   }
 }
 

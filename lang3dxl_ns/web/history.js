@@ -54,19 +54,12 @@ export class Steps {
     });
   }
 
-  /** Keep an address: as a step of its own if more than the view differs from before, or if asked for. */
-  keep(hash, own = false) {
-    if (own || without(hash) !== without(this.hash)) this.last = this.now += 1;
+  /** Keep an address: as a step of its own if more than the view differs from before, or as told. */
+  keep(hash, own = without(hash) !== without(this.hash)) {
+    if (own) this.last = this.now += 1;
     else if (hash === this.hash && history.state) return;
     const moved = this.now > (history.state?.step ?? 0);
     history[moved && history.state ? "pushState" : "replaceState"]({ step: this.now }, "", hash);
-    this.hash = hash;
-    this.changed();
-  }
-
-  /** Take over an address without a step: the one that the page opens with. */
-  begin(hash) {
-    history.replaceState({ step: this.now }, "", hash);
     this.hash = hash;
     this.changed();
   }
@@ -90,7 +83,7 @@ export class Steps {
 
 function without(hash) {
   const fields = new URLSearchParams(hash.slice(1));
-  fields.delete("view");
+  for (const name of ["view", "shape"]) fields.delete(name);
   return String(fields);
 }
 

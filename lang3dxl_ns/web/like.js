@@ -72,21 +72,14 @@ export function fitted(samples, size, ridge = RIDGE, steps = STEPS) {
   return weights;
 }
 
-/** Solve a symmetric positive system, given its lower half, which its Cholesky factors overwrite. */
-function solved(matrix, right) {
-  const size = right.length, found = Float64Array.from(right);
-  for (let j = 0; j < size; j++) {
-    for (let k = 0; k <= j; k++) {
-      let sum = matrix[j][k];
-      for (let m = 0; m < k; m++) sum -= matrix[j][m] * matrix[k][m];
-      matrix[j][k] = j === k ? Math.sqrt(Math.max(sum, 1e-12)) : sum / matrix[k][k];
+/** Solve a symmetric positive system, given its lower half, by elimination. */
+function solved(lower, right) {
+  const rows = lower.map((row, j) => [...lower.map((other, k) => (k <= j ? row[k] : other[j])), right[j]]);
+  rows.forEach((pivot, j) => {
+    for (const row of rows) {
+      const factor = row === pivot ? 0 : row[j] / Math.max(pivot[j], 1e-12);
+      if (factor) for (let k = j; k < row.length; k++) row[k] -= factor * pivot[k];
     }
-    for (let k = 0; k < j; k++) found[j] -= matrix[j][k] * found[k];
-    found[j] /= matrix[j][j];
-  }
-  for (let j = size - 1; j >= 0; j--) {
-    for (let k = j + 1; k < size; k++) found[j] -= matrix[k][j] * found[k];
-    found[j] /= matrix[j][j];
-  }
-  return found;
+  });
+  return rows.map((row, j) => row.at(-1) / Math.max(row[j], 1e-12));
 }

@@ -1,11 +1,13 @@
 // The list of a word's things: how many were found, one after the other, their boxes, and questions about them.
-import { element, shown, small } from "./cards.js";
+import { element, say, shown, small } from "./cards.js";
 import { answerTo, count, parse, unsure, wordsOf } from "./grammar.js";
 import { Vector3 } from "./library.js";
 import { heightAsText, inShares, lengthAsText } from "./measure.js";
+import { advice } from "./vocabulary.js";
 
 const NAMESPACE = "http://www.w3.org/2000/svg", CORNERS = [0, 1, 2, 3, 4, 5, 6, 7];
 const FILLED = 0.35, NARROW = 15, WIDE = 60; // share of the window that a thing fills after a flight; degrees of the lens
+const MOST_NUMBERS = 8; // of things that are named one by one
 const GAP = 4, LETTER = 8, LINE = 18; // pixels between labels, per letter, and of a line
 
 export class List extends EventTarget {
@@ -13,7 +15,7 @@ export class List extends EventTarget {
    * the list, or what is chosen in it, has changed. */
   constructor(about, think, view, prompts) {
     super();
-    Object.assign(this, { about, think, view, prompts, chosen: null, alone: false, wanted: null });
+    Object.assign(this, { about, think, view, prompts, chosen: null, wanted: null });
   }
 
   /** Find a prompt's things, once for each of its answers; resolves to { things, candidates }. */
@@ -23,9 +25,8 @@ export class List extends EventTarget {
     const found = await prompt.counting.found;
     if (prompt.turn !== turn || prompt.found === found) return found;
     prompt.found = found;
-    if (this.chosen?.prompt === prompt) this.forget();
-    const again = this.wanted && found.things.find(({ id, rows }) => id === this.wanted.id || rows.includes(this.wanted.id));
-    if (again && this.wanted.word === prompt.text) this.take(prompt, again, this.wanted.alone);
+    this.tidy(prompt);
+    if (this.wanted?.word === prompt.text) this.takeAgain(prompt);
     this.dispatchEvent(new Event("change"));
     return found;
   }
@@ -56,7 +57,7 @@ export class List extends EventTarget {
     });
     const [wide, deep, high] = own ? this.chosen.thing.size.map((side) => lengthAsText(side, this.about)) : [];
     made.append(element("p", { className: "size" }, own ? `${high} high, ${wide} × ${deep} wide and deep, its middle ${heightAsText(this.chosen.thing.center, this.about)}${inShares(this.about)}.` : ""), element("div", {}, small("‹", () => this.step(-1, prompt), { ariaLabel: "Previous thing" }), small("›", () => this.step(1, prompt), { ariaLabel: "Next thing" }),
-      small("Hide the rest", () => this.hideRest(!this.alone), { ariaPressed: String(own && this.alone), disabled: !own })), listed); // prettier-ignore
+      small("Hide the rest", () => this.hideRest(!this.view.only), { ariaPressed: String(own && Boolean(this.view.only)), disabled: !own })), listed); // prettier-ignore
     return made;
   }
 
@@ -64,15 +65,21 @@ export class List extends EventTarget {
 
   /** Choose a thing, and fly to it. */
   choose(prompt, thing) {
-    this.take(prompt, thing, this.alone);
     const photo = this.about.views[thing.seen[0]?.view];
     if (photo) {
       const { position } = this.view.mover.standing(photo), target = new Vector3(...thing.center), size = Math.max(...thing.size);
       const fov = (360 / Math.PI) * Math.atan(size / FILLED / 2 / Math.max(position.distanceTo(target), 1e-6));
-      this.view.mover.walk(false);
       this.view.mover.fly({ position, target, fov: Math.max(NARROW, Math.min(fov, WIDE)) });
     }
-    this.dispatchEvent(new Event("change"));
+    this.take(prompt, thing, this.view.only);
+  }
+
+  /** Choose the thing that an address names, or say that it isn't among those found. */
+  takeAgain(prompt) {
+    const { id: wanted, alone } = this.wanted, again = prompt.found.things.find(({ id, rows }) => id === wanted || rows.includes(wanted));
+    if (again) return this.take(prompt, again, alone);
+    this.wanted = null;
+    say(`The thing that this link names is not among those found: ${shown(prompt.text)}.`);
   }
 
   take(prompt, thing, alone) {
@@ -89,21 +96,15 @@ export class List extends EventTarget {
     return Boolean(before);
   }
 
-  /** Choose nothing any more, before the next drawing. */
-  forget() {
-    Object.assign(this, { chosen: null, alone: false });
-    this.view.only = null;
-  }
-
-  /** Forget the chosen thing if its prompt is gone. */
-  tidy() {
-    if (this.chosen && !this.prompts.includes(this.chosen.prompt)) this.forget();
+  /** Choose nothing any more, before the next drawing, if the prompt is gone or has this new answer. */
+  tidy(answered = null) {
+    const { prompt } = this.chosen ?? {};
+    if (prompt && (prompt === answered || !this.prompts.includes(prompt))) this.chosen = this.view.only = null;
   }
 
   /** Show the chosen thing alone, or everything. */
   hideRest(alone) {
-    this.alone = Boolean(alone && this.chosen);
-    this.view.only = this.alone ? new Set(this.chosen.thing.rows) : null;
+    this.view.only = alone && this.chosen ? new Set(this.chosen.thing.rows) : null;
     this.view.recolor(this.view.shown);
     this.dispatchEvent(new Event("change"));
   }
@@ -124,10 +125,10 @@ export class List extends EventTarget {
     return false;
   }
 
-  /** The chosen thing as fields of an address, and back. */
+  /** The chosen thing, or the one that will be once its word is answered, as fields of an address, and back. */
   get fields() {
-    const { prompt, thing } = this.chosen ?? {};
-    return thing ? { thing: `${thing.id} ${prompt.text}`, alone: this.alone ? 1 : "" } : {};
+    const { prompt, thing } = this.chosen ?? {}, { id, word, alone } = thing ? { id: thing.id, word: prompt.text, alone: this.view.only } : this.wanted ?? {};
+    return word ? { thing: `${id} ${word}`, alone: alone ? 1 : "" } : {};
   }
 
   set fields({ thing, alone }) {
@@ -153,15 +154,16 @@ export class List extends EventTarget {
     Object.assign(first, { listed: true, asked: every ? null : new Set(chosen.map(({ id }) => id)) });
     const sure = asked.every(({ trust }) => trust.level === "sure" && !trust.far) ? "" : " Not sure: see the cards.";
     const doubt = request.count && every ? null : unsure(request, found, view, shown);
-    const note = (doubt ? ` Unsure, since ${doubt}.` : "") + sure;
+    const note = [doubt ? ` Unsure, since ${doubt}.` : "", sure, ...words.flatMap(advice).map((told) => ` But ${told}.`)].join("");
     if (request.count) {
       this.dispatchEvent(new Event("change"));
       return `${every ? count(first.found) : chosen.length} ${shown(request.word)}.${note}`;
     }
     if (chosen.length) this.choose(first, chosen[0]);
     else this.dispatchEvent(new Event("change"));
-    const numbers = chosen.map((thing) => things[request.word].indexOf(thing) + 1).join(", ");
-    return (chosen.length ? `${shown(request.word)} ${numbers}.` : `Found no such ${shown(request.word)}.`) + note;
+    const numbers = chosen.map((thing) => things[request.word].indexOf(thing) + 1).join(", "), name = shown(request.word);
+    if (!chosen.length) return `Found no such ${name}.${note}`;
+    return (chosen.length > MOST_NUMBERS ? `${chosen.length} of ${things[request.word].length} ${name}.` : `${name} ${numbers}.`) + note;
   }
 
   /** Directions of the viewer: right, up and ahead. */

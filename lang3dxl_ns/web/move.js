@@ -3,7 +3,7 @@ import { OrbitControls, PerspectiveCamera, Vector3 } from "./library.js";
 import { isFree } from "./space.js";
 
 const FLIGHT = 1200, WIDEST = 110, ROOM = 8; // milliseconds, degrees of a lens, pixels between a landmark and buttons
-const TURN = 0.1, TAP = 0.1, PACE = 0.25; // radians and seconds of a key press; share of the overview's depth walked in a second
+const TURN = 0.1, TAP = 0.1, NEARER = 0.1, PACE = 0.25; // radians, seconds and share of the distance of a key press; share of the overview's depth walked in a second
 const LOOK = 0.003, WHEEL = 0.001, STEEPEST = 1.5; // radians per pixel, seconds per unit of the wheel, radians
 const WAYS = { w: [0, 0, 1], s: [0, 0, -1], a: [-1, 0, 0], d: [1, 0, 0], q: [0, -1, 0], e: [0, 1, 0] }; // right, up, ahead
 export const still = matchMedia("(prefers-reduced-motion: reduce)");
@@ -42,15 +42,15 @@ export class Mover extends EventTarget {
     return { position: this.camera.position.clone(), target: this.controls.target.clone(), fov: this.camera.fov };
   }
 
-  place({ position, target, fov }) {
+  /** Stand somewhere. whole: whether the stand is the overview of this window. */
+  place({ position, target, fov, whole = false }) {
     this.placing = true;
     this.camera.position.copy(position);
     this.controls.target.copy(target);
     this.camera.fov = fov;
     this.camera.updateProjectionMatrix();
     this.controls.update();
-    this.placing = false;
-    this.last = this.stand;
+    Object.assign(this, { placing: false, last: this.stand, whole });
     this.wake();
   }
 
@@ -60,14 +60,15 @@ export class Mover extends EventTarget {
     return [...position.toArray(), ...target.toArray(), fov].map((value) => +value.toPrecision(5)).join();
   }
 
-  set address(text) {
-    this.goTo(text);
-  }
-
-  /** Go to a viewpoint that is written as `address` is, at once or in a flight. */
-  goTo(text = "", flying = false) {
+  /** Go to a viewpoint that is written as `address` is, at once or in a flight. shape: width over height of the window
+   * that it was seen in; a narrower one shows as much to both sides. Returns whether the text is a viewpoint. */
+  goTo(text = "", flying = false, shape = 0) {
     const stand = standOf(text);
-    if (stand) flying ? this.fly(stand) : this.jump(stand);
+    if (!stand) return false;
+    const widened = (360 / Math.PI) * Math.atan(Math.tan((stand.fov * Math.PI) / 360) * Math.max(shape / this.aspect, 1));
+    stand.fov = Math.min(widened, Math.max(WIDEST, stand.fov));
+    flying ? this.fly(stand) : this.jump(stand);
+    return true;
   }
 
   /** Stand somewhere at once, without a flight. */
@@ -101,7 +102,7 @@ export class Mover extends EventTarget {
     const slope = Math.min(Math.max((half(top, bottom) * height) / clear, half(left, right) / this.aspect), Math.tan((WIDEST * Math.PI) / 360));
     const lift = Math.atan((slope * (above - below)) / height); // how far above the axis the middle of what is free lies
     const ahead = axis(2).negate().addScaledVector(axis(0), Math.tan(middle(left, right))).addScaledVector(axis(1), -Math.tan(middle(top, bottom) - lift)).normalize();
-    return { position: start.position, target: start.position.clone().addScaledVector(ahead, depth), fov: (360 / Math.PI) * Math.atan(slope) };
+    return { position: start.position, target: start.position.clone().addScaledVector(ahead, depth), fov: (360 / Math.PI) * Math.atan(slope), whole: true };
   }
 
   /** Pixels that buttons cover at the top of the frame, and photos at its bottom. */
@@ -114,19 +115,23 @@ export class Mover extends EventTarget {
 
   /** Fly to a viewpoint, around its target rather than through it. */
   fly(stand) {
+    this.walk(false);
     this.dispatchEvent(new Event("far"));
     this.flight = { from: this.stand, to: stand, start: performance.now() };
     this.wake();
   }
 
   overview() {
-    this.walk(false);
     this.fly(this.overviewStand());
+  }
+
+  /** Show the whole landmark again in a window of another shape, if it is shown. */
+  refit() {
+    if (this.whole) this.place(this.overviewStand());
   }
 
   /** Turn to a point of the world, and orbit around it from now on. */
   focus(point) {
-    this.walk(false);
     this.fly({ ...this.stand, target: new Vector3(...point) });
   }
 
@@ -168,7 +173,7 @@ export class Mover extends EventTarget {
     this.flight = null;
     const { position } = this.camera, { last } = this;
     if (this.reached(last.position, position, this.free || this.shift) !== position) this.place(last);
-    this.last = this.stand;
+    Object.assign(this, { last: this.stand, whole: false });
     this.wake();
   }
 
@@ -199,33 +204,32 @@ export class Mover extends EventTarget {
     this.jump({ position: place, target: target.add(place).sub(position), fov });
   }
 
-  /** Whether keys that move are held. */
-  get striding() {
-    return this.held.size > 0;
+  /** Whether the eye flies, or keys that move it are held. */
+  get moving() {
+    return Boolean(this.flight) || this.held.size > 0;
   }
 
   /** Go on with what keys are held. Called before each frame. */
   update(now) {
     if (this.flight) this.advance(now);
     const seconds = Math.min((now - (this.before ?? now)) / 1000, 0.3);
-    this.before = this.striding ? now : undefined;
+    this.before = this.held.size ? now : undefined;
     for (const way of this.held.values()) if (seconds > 0) this.go(way, seconds);
     if (this.controls.enabled) this.controls.update();
-    if (this.striding) this.wake();
+    if (this.held.size) this.wake();
   }
 
   /** Steer by a key; returns whether it has a meaning. */
   steer({ key, repeat }) {
     const name = key.length === 1 ? key.toLowerCase() : key, way = WAYS[name];
-    const turn = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1], PageUp: [0, 1], PageDown: [0, -1] }[name];
+    const turn = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] }[name];
     const zoom = { "+": 1, "=": 1, "-": -1 }[name];
     if (name === "Home") this.overview();
     else if (way) this.stride(name, way, repeat);
-    else if (turn && name.startsWith("Page")) this.look(0, TURN * turn[1]);
     else if (turn && this.walking) turn[0] ? this.look(TURN * turn[0], 0) : this.stride(name, [0, 0, turn[1]], repeat);
     else if (turn) this.circle(TURN * turn[0], TURN * turn[1]);
     else if (zoom && this.walking) this.go([0, 0, zoom], 2 * TAP, true);
-    else if (zoom) this.approach(zoom > 0 ? 0.9 : 1.1);
+    else if (zoom) this.moveTo(this.stand.position.lerp(this.stand.target, zoom * NEARER));
     else return false;
     return true;
   }
@@ -243,11 +247,6 @@ export class Mover extends EventTarget {
     const turned = offset.clone().applyAxisAngle(axis.clone().cross(offset).normalize(), -up);
     if (turned.angleTo(axis) > 0.05 && turned.angleTo(axis) < 3.09) offset.copy(turned);
     this.moveTo(target.clone().add(offset.applyAxisAngle(axis, aside)));
-  }
-
-  approach(factor) {
-    const { position, target } = this.stand;
-    this.moveTo(target.clone().add(position.sub(target).multiplyScalar(factor)));
   }
 
   moveTo(aim) {

@@ -8,11 +8,12 @@ import { List } from "./list.js";
 import { distanceAsText, drawScale, heightAsText, inShares, setLength } from "./measure.js";
 import { Photos } from "./photos.js";
 import { areExamples, asPython, drawOutline, examplesAsText, examplesFromText, inside, rounded, UNNAMED, wordsFile } from "./teach.js";
-import { fetched, thinker } from "./think.js";
+import { fetched, request, thinker } from "./think.js";
 import { Tour } from "./tour.js";
 import { parsePrompts, tidy } from "./vocabulary.js";
 import { View } from "./view.js";
 
+const MIDDLE = /^(what('s| is| am i looking at)( this| that| it| here| there)?|was ist das)\W*$/i; // questions about what one sees
 const MOST_TRIED = 6, TIE = 0.02, HALF = "50"; // suggested words; relevancies that tell words apart; how many floaters a page hides at first
 const prompts = [], taughtHere = new Set(); // names that were taught to the server's scene from here
 let about, view, photos, list, tour, steps, kept, settled = false, cleared = 0; // settled: the address has been read; cleared: how often all prompts were removed
@@ -73,6 +74,11 @@ function clear() {
 async function ask(typed, turn = cleared) {
   await reading;
   quiet();
+  if (about.words && MIDDLE.test(typed)) {
+    await describe(middle());
+    say("This is in the middle of the view. Click on anything else to learn what it is.");
+    return { known: true };
+  }
   if (about.words && isQuestion(String(typed))) return answerQuestion(String(typed));
   let found = null;
   for (const { text, negatives } of about.words ? parsePrompts(String(typed), names()) : []) {
@@ -126,7 +132,7 @@ const unusedColor = () => about.colors.find((color) => prompts.every((prompt) =>
 /** Take away messages about what was done before. */
 function quiet() {
   $("near").replaceChildren();
-  say(explain(about));
+  say(explain(about), true);
 }
 
 /** Run work that may fail, and show the reason if it does. */
@@ -166,8 +172,7 @@ function fly(prompt) {
   if (!views.length) return;
   prompt.place = ((prompt.place ?? -1) + 1) % views.length;
   const best = views[prompt.place];
-  photos.hide();
-  view.mover.walk(false);
+  photos.hide(false);
   view.mover.fly(view.mover.standing(about.views[best.index], best.target));
   say(`View ${prompt.place + 1} of ${views.length}: ${best.name}; ${percent(best.area)} of it matches.`);
 }
@@ -231,6 +236,11 @@ async function tell({ x, y, without }) {
   if ($("measuring").checked) return measure(x, y);
   const teaching = prompts.find((prompt) => prompt.examples && prompt.open);
   if (teaching) return addMark(teaching, [[x, y]], without || teaching.without);
+  await describe({ x, y });
+}
+
+/** Tell which words fit a place, or choose the thing there. */
+async function describe({ x, y }) {
   const { words, rows, point } = await whatIs(x, y);
   if (list.pick(rows)) return;
   const best = words[0]?.[1] ?? 0;
@@ -246,7 +256,6 @@ async function tell({ x, y, without }) {
 
 /** Turn around what is at a pixel, from now on. */
 async function focusOn({ x, y }) {
-  $("here").hidden = true;
   const point = about.words ? await think("point", { camera: view.picking, x, y }) : null;
   if (point) view.mover.focus(point);
 }
@@ -273,6 +282,7 @@ function teach(prompt, open = !prompt.open) {
   if (!open && !prompt.examples.length) prompts.splice(prompts.indexOf(prompt), 1);
   $("here").hidden = true;
   quiet();
+  if (open && !prompt.examples.length) say("Click on it in the view, or outline it. Then give it a name.");
   draw(prompts.includes(prompt) ? prompt : null);
 }
 
@@ -303,7 +313,7 @@ async function outline(prompt) {
   if (found) await attempt(() => addMark(prompt, inside(found), prompt.without, found));
 }
 
-const post = (path, content) => fetch(path, { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(content) });
+const post = (path, content) => request(path, { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(content) });
 
 /** Keep the tour in the address and, behind a live page, in the scene's file. */
 async function keepTour() {
@@ -366,13 +376,14 @@ function asField(prompt) {
 const shownNow = (stops = tour.fields) =>
   written({
     stops,
-    view: view.mover.address, walk: view.mover.walking ? 1 : "", hide: $("hide").value === HALF ? "" : $("hide").value, look: chosenLook,
+    view: view.mover.address, shape: view.mover.aspect.toFixed(2), walk: view.mover.walking ? 1 : "", hide: $("hide").value === HALF ? "" : $("hide").value, look: chosenLook,
     unit: about.unit, cameras: $("cameras").ariaPressed === "true" ? 1 : "", photo: photos.shown?.name, ...list.fields,
     prompts: prompts.filter(({ examples }) => !examples || examples.length).map(asField),
   }); // prettier-ignore
 
-/** Keep what is shown in the address. own: whether Back returns to here even if only the view changes. */
-function keepAddress(own = false) {
+/** Keep what is shown in the address. own: whether that is a step of its own; what changes during a flight belongs to
+ * the flight's. */
+function keepAddress(own = view.mover.flight ? false : undefined) {
   if (settled) steps.keep(shownNow(), own);
 }
 
@@ -381,9 +392,10 @@ async function apply(hash, turn = drop(), isStop = false) {
   const wanted = readFields(hash), found = [], open = prompts.find((prompt) => prompt.open)?.text;
   settled = false;
   outlining?.abort();
+  quiet();
   photos.hide();
   if (!isStop) Object.assign(tour, { fields: wanted.stops }).stop();
-  view.mover.goTo(wanted.view, isStop);
+  const there = view.mover.goTo(wanted.view, isStop, Number(wanted.shape) || 0), photo = photos.list.find((one) => one.photo && one.name === wanted.photo);
   view.mover.walk(wanted.walk === "1");
   if (!isStop) about.unit = Number(wanted.unit) > 0 && Number.isFinite(Number(wanted.unit)) ? Number(wanted.unit) : null;
   $("cameras").ariaPressed = String(wanted.cameras === "1");
@@ -403,9 +415,11 @@ async function apply(hash, turn = drop(), isStop = false) {
     list.fields = wanted;
     for (const prompt of found) if (prompt.named) keepWord(prompt);
     for (const prompt of found) if (taughtHere.has(prompt.text) && !prompt.inScene) attempt(() => teachScene(prompt));
-    const photo = photos.list.find(({ name }) => name === wanted.photo);
-    if (photo?.photo && isStop) photos.coming = photo;
-    else if (photo?.photo) photos.show(photo);
+    if (photo && isStop) photos.coming = photo;
+    else if (photo) photos.show(photo);
+    const lost = { view: wanted.view && !there, photo: wanted.photo && !photo, lighting: wanted.look && !chosenLook, marks: wanted.prompts.some((one) => one.kind === "like" && !specify(one).length) };
+    const told = Object.keys(lost).filter((name) => lost[name]);
+    if (told.length) say(`This link asks for what this page doesn't have: ${told.join(", ")}.`);
   } finally {
     if (turn === cleared) settle(hash);
   }
@@ -422,7 +436,7 @@ function specify({ kind, text, at }) {
 /** End the reading of an address: what is shown is what it says now. */
 function settle(hash = null) {
   settled = true;
-  if (hash !== null) steps.begin(shownNow());
+  if (hash !== null) steps.keep(shownNow(), false);
   draw();
 }
 
@@ -450,7 +464,7 @@ function listen() {
   });
   for (const kind of ["input", "focus"]) on("word", kind, (event) => reading.then(() => offer(event)));
   on("clear", "click", clear);
-  on("overview", "click", () => (photos.hide(), quiet(), view.mover.overview()));
+  on("overview", "click", () => (photos.hide(false), quiet(), view.mover.overview()));
   on("teach", "click", () => startWord().card.querySelector("button").focus()); // no name yet: a phone's keyboard would cover the view
   on("still", "click", async () => download("scene.png", await view.picture()));
   on("link", "click", copyLink);
@@ -459,7 +473,7 @@ function listen() {
   on("hide", "change", () => keepAddress());
   on("undo", "click", () => steps.undo());
   on("redo", "click", () => steps.redo());
-  on("walk", "click", () => (view.mover.walk(), $("frame").focus()));
+  on("walk", "click", () => (view.mover.walk(), keepAddress(), $("frame").focus()));
   on("cameras", "click", ({ currentTarget }) => {
     $("cameras").ariaPressed = String($("cameras").ariaPressed !== "true");
     photos.draw();
@@ -482,7 +496,7 @@ function listen() {
     clearTimeout(moving);
     moving = setTimeout(keepAddress, 300);
   });
-  view.mover.addEventListener("far", () => keepAddress(true));
+  view.mover.addEventListener("far", () => (($("here").hidden = true), keepAddress(true))); // what is told of a place is of this view
   view.mover.addEventListener("walks", () => ($("walk").ariaPressed = String(view.mover.walking)));
   view.mover.addEventListener("blocked", () => say("The photos show nothing of what is there: hold Shift, or choose “Go anywhere” under More, to go on."));
   addEventListener("keydown", (event) => press(event));
@@ -563,8 +577,8 @@ async function open() {
   await unpacked;
   view = new View(about, $("frame"));
   list = new List(about, think, view, prompts);
-  photos = new Photos(about, view, (name) => attempt(() => light(name === null ? chosenLook : name in about.looks ? name : chosenLook)));
-  photos.changed = () => keepAddress();
+  photos = new Photos(about, view, (name) => attempt(() => light(name in about.looks ? name : chosenLook)));
+  photos.changed = keepAddress;
   tour = new Tour(() => shownNow([]), (hash) => attempt(() => apply(hash, drop(), true)), () => attempt(keepTour));
   steps = new Steps((hash) => attempt(() => apply(hash)), () => {
     $("undo").disabled = !steps.past;
@@ -577,10 +591,10 @@ async function open() {
 }
 
 async function readMeaning(splats) {
-  say(explain(about));
+  quiet();
   if (!about.words) return;
   about.known = await think("load", { description: about, splats });
-  say(explain(about));
+  quiet();
   $("try").replaceChildren("Try: ", ...words().slice(0, MOST_TRIED).map((word) => askFor(word)));
 }
 

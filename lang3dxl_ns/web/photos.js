@@ -7,8 +7,9 @@ export class Photos {
   /** about: the page's description; view: the picture; looks: called with a photo's name, to show its lighting. */
   constructor(about, view, light) {
     Object.assign(this, { about, view, light, list: about.cameras ?? [], shown: null, at: -1, buttons: new Map() });
-    $("strip").hidden = !this.pictured.length;
-    $("strip").append(...this.pictured.map((photo) => this.thumbnail(photo)));
+    const pictured = this.list.filter(({ photo }) => photo);
+    $("strip").hidden = !pictured.length;
+    $("strip").append(...pictured.map((photo) => this.thumbnail(photo)));
     for (const name of ["before", "after", "cameras"]) $(name).disabled = !this.list.length;
     $("before").addEventListener("click", () => this.step(-1));
     $("after").addEventListener("click", () => this.step(1));
@@ -17,10 +18,6 @@ export class Photos {
     $("photo").addEventListener("error", () => this.shown && (say(`${this.shown.name} can't be shown: it is missing or damaged.`), this.hide()));
     $("photo").addEventListener("load", () => $("over").classList.add("there"));
     view.addEventListener("moved", () => this.follow());
-  }
-
-  get pictured() {
-    return this.list.filter(({ photo }) => photo);
   }
 
   thumbnail(photo) {
@@ -38,9 +35,8 @@ export class Photos {
 
   /** Fly into a photo's pose, where it fades over the rendering if the page has it. */
   visit(photo) {
-    this.hide();
+    this.hide(false);
     this.at = this.list.indexOf(photo);
-    this.view.mover.walk(false);
     this.view.mover.fly(this.view.mover.standing(photo));
     this.coming = photo.photo ? photo : null;
     say(photo.doubtful ? `${photo.name}: its place is doubtful: ${photo.doubtful}.` : `Photo ${this.at + 1} of ${this.list.length}: ${photo.name}.`);
@@ -67,17 +63,18 @@ export class Photos {
     this.buttons.get(photo)?.scrollIntoView({ block: "nearest", inline: "nearest" });
     this.arrange();
     this.light(photo.name);
-    this.changed?.();
+    this.changed?.(false);
   }
 
-  hide() {
+  /** Hide the photo. own: whether that is a step of its own, rather than part of a flight. */
+  hide(own = true) {
     const { shown } = this;
     Object.assign(this, { shown: null, coming: null });
     $("over").hidden = true;
     if (!shown) return;
     this.buttons.get(shown)?.removeAttribute("aria-current");
     this.light(null);
-    this.changed?.();
+    if (own) this.changed?.();
   }
 
   /** Put the photo exactly where the rendering shows what it shows. */

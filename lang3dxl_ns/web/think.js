@@ -1,8 +1,17 @@
 // The page's worker: jobs that think about the scene beside its drawing.
 
+/** Ask the page's server, as `fetch` does. */
+export async function request(...asked) {
+  try {
+    return await fetch(...asked);
+  } catch {
+    throw new Error("The server of this page doesn't answer: start it again, or check the connection.");
+  }
+}
+
 /** Fetch a file of the page; a written page's data have names by content. */
 export async function fetched(name, about = null) {
-  const file = await fetch(about?.files?.[name] ?? name);
+  const file = await request(about?.files?.[name] ?? name);
   if (!file.ok) throw new Error(`${name} is missing (${file.status}): write the page again.`);
   return file;
 }

@@ -39,7 +39,7 @@ export class View extends EventTarget {
     this.scene.add(root.mesh);
     this.root = root;
     this.parts.set(0, root);
-    this.mover.place(this.mover.overviewStand()); // now that the page's strip of photos covers its part
+    this.mover.refit(); // now that the page's strip of photos covers its part
     this.recolor();
   }
 
@@ -98,11 +98,6 @@ export class View extends EventTarget {
     this.recolor(this.shown);
   }
 
-  upload() {
-    for (const part of this.parts.values()) part.upload();
-    this.wake();
-  }
-
   // ── frames ──
 
   /** Redraw: a draft that keeps up on slow machines and, once nothing changes, a sharp picture. */
@@ -115,7 +110,7 @@ export class View extends EventTarget {
   /** Redraw what has changed before an eye that rests: the picture stays sharp, however long detail arrives. */
   refresh() {
     this.sharp = false;
-    if (this.held || this.mover.flight || this.mover.striding) this.changed = true;
+    if (this.held || this.mover.moving) this.changed = true;
     this.request();
   }
 
@@ -126,7 +121,7 @@ export class View extends EventTarget {
 
   /** Whether nothing is left to draw. */
   get resting() {
-    return !this.mover.flight && !this.mover.striding && !this.changed && this.sharp && !this.drawing;
+    return !this.mover.moving && !this.changed && this.sharp && !this.drawing;
   }
 
   step(now) {
@@ -186,6 +181,7 @@ export class View extends EventTarget {
     this.renderer.setSize(width, height);
     this.camera.aspect = width / height;
     this.camera.updateProjectionMatrix();
+    this.mover.refit();
     this.wake();
   }
 
@@ -221,7 +217,10 @@ export class View extends EventTarget {
       this.dispatchEvent(new CustomEvent(again ? "double" : "click", { detail }));
     });
     this.canvas.addEventListener("webglcontextlost", () => (this.drawing = null));
-    this.canvas.addEventListener("webglcontextrestored", () => this.upload());
+    this.canvas.addEventListener("webglcontextrestored", () => {
+      for (const part of this.parts.values()) part.upload();
+      this.wake();
+    });
   }
 
   /** Return the picture as a PNG. */

@@ -1,6 +1,7 @@
 // Words that this scene knows, in its own numbers, and phrases that a live server encodes.
 import { floats } from "./decode.js";
 import language from "./language.js"; // written beside this file from query/language.json
+import { request } from "./think.js";
 
 const MOST_TEXT = 2000; // most characters of a phrase
 
@@ -99,7 +100,7 @@ export class Vocabulary {
     const plain = [...tidy(text)].slice(0, MOST_TEXT).join(""), known = this.place(plain);
     if (!this.live) return known === undefined ? null : this.word(known);
     if (!this.encoded.has(plain)) {
-      const answer = await fetch(`api/encode?text=${encodeURIComponent(plain)}`);
+      const answer = await request(`api/encode?text=${encodeURIComponent(plain)}`);
       if (!answer.ok) throw new Error(await answer.text());
       this.encoded.set(plain, { name: plain, ...(await answer.json()) });
     }

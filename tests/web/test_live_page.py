@@ -237,6 +237,25 @@ def test_a_name_that_is_half_typed_stays_when_an_answer_arrives(browser, file, t
 
 
 @pytest.mark.slow
+def test_a_page_whose_server_is_gone_says_so_also_with_a_folded_panel(browser, file):
+    with live(file) as server:
+        page = opened(browser, address_of(server), DESK)
+        page.context.route("**/api/**", lambda route: route.abort())
+        page.get_by_role("button", name="Panel").click()
+        page.evaluate("location.hash = 'ask=campanile'")
+        page.get_by_text("server of this page doesn't answer").wait_for()  # Playwright waits until it is seen
+        page.get_by_role("button", name="Panel").click()
+        page.get_by_role("button", name="Teach a word").click()
+        page.mouse.click(*spot(page, painted_scene(), 1.5, 1.5))
+        page.get_by_text("1 example").wait_for()
+        name = page.get_by_role("textbox", name="Name")
+        name.fill("gizmo")
+        name.press("Enter")
+        page.get_by_text("server of this page doesn't answer").wait_for()
+        page.close()
+
+
+@pytest.mark.slow
 def test_a_static_page_writes_words_that_the_scene_learns_as_if_marked_there(browser, file, photos, tmp_path):
     scene = read_scene(file, "cpu")
     write_page(Page(scene, photos=photos), tmp_path / "page")

@@ -116,7 +116,7 @@ def test_the_arrow_points_north(browser, tmp_path):
             "0,-1,4",
             "0,0,-4",
         ):  # looking north, south, east, west
-            tab.evaluate(f"lang3dxl.view.mover.address = '{eye},0,0,0,60'")
+            tab.evaluate(f"lang3dxl.view.mover.goTo('{eye},0,0,0,60')")
             tab.evaluate(FRAMES)
             angles.append(tab.evaluate(SCALE)["arrow"])
         tab.close()

@@ -106,6 +106,41 @@ def test_the_eye_stays_before_the_wall_unless_shift_is_held(page):
 
 
 @pytest.mark.slow
+def test_the_first_view_is_fitted_again_to_what_a_panel_leaves_until_one_moves(browser, address):
+    page = opened(browser, address, PHONE)
+    fitted = """(({ stand }, whole = lang3dxl.view.mover.overviewStand()) =>
+      Math.abs(stand.fov - whole.fov) + stand.target.distanceTo(whole.target) < 1e-6)(lang3dxl.view.mover)"""
+    grow = "(css) => document.styleSheets[0].insertRule(css, document.styleSheets[0].cssRules.length)"
+    until(page, fitted)
+    for height in ("max-height: 20%", "min-height: 60%"):
+        before = page.evaluate("lang3dxl.view.mover.aspect")
+        page.evaluate(grow, f"#panel {{ {height} }}")
+        until(page, f"lang3dxl.view.mover.aspect !== {before} && {fitted}")
+    page.locator("#frame").press("+")
+    before = page.evaluate("lang3dxl.view.mover.address")
+    page.set_viewport_size({"width": 844, "height": 390})
+    until(page, "innerWidth", 844)
+    page.wait_for_timeout(300)
+    assert page.evaluate("lang3dxl.view.mover.address") == before
+    page.close()
+
+
+@pytest.mark.slow
+def test_a_link_opened_in_a_narrower_window_shows_as_much_to_both_sides(page, browser, address):
+    page.set_viewport_size({"width": 1440, "height": 600})
+    page.locator("#frame").press("+")
+    wide = "Math.tan(lang3dxl.view.camera.fov * Math.PI / 360) * lang3dxl.view.camera.aspect"
+    until(page, "location.hash.includes(`shape=${lang3dxl.view.mover.aspect.toFixed(2)}`)")
+    shown, link = page.evaluate(wide), page.url
+    page.set_viewport_size(DESK)
+    for size in (PHONE, {"width": 1600, "height": 400}):
+        other = opened(browser, link, size)
+        assert page.evaluate("lang3dxl.view.camera.fov") <= other.evaluate("lang3dxl.view.camera.fov") + 1e-3
+        assert other.evaluate(wide) >= 0.98 * min(shown, 1.4 * other.evaluate("lang3dxl.view.camera.aspect"))
+        other.close()
+
+
+@pytest.mark.slow
 def test_a_double_click_turns_around_what_is_there(page, scene):
     camera = scene.overview.full_camera
     x, y, z = camera.intrinsics.numpy() @ camera.view_matrix[:3].numpy() @ [1.5, 1.5, 0, 1]

@@ -81,6 +81,49 @@ def test_a_link_carries_thresholds_colors_and_moving(page, browser, address):
 
 
 @pytest.mark.slow
+def test_a_link_says_what_this_page_lacks_and_nothing_of_the_link_before(page):
+    shown = "['near', 'status'].map((id) => document.getElementById(id).textContent).join(' ')"
+    for link, told in (
+        ("view=1,2&ask=dome", "doesn't have: view."),
+        ("look=x.jpg&photo=y.jpg&like=z~999999", "doesn't have: photo, lighting, marks."),
+        ("ask=zzz", "doesn't know “zzz”"),
+        ("ask=dome&thing=999999+dome", "not among those found"),
+    ):
+        page.evaluate("(link) => { location.hash = link; }", link)
+        until(page, f"{shown}.includes({told!r})")
+    page.evaluate("location.hash = 'ask=windows'")
+    until(page, "lang3dxl.prompts.map(({ text }) => text).join()", "windows")
+    assert "zzz" not in page.evaluate(shown) and "not among" not in page.evaluate(shown)
+
+
+@pytest.mark.slow
+def test_a_flight_with_what_it_shows_is_one_step(page):
+    page.emulate_media(reduced_motion="reduce")
+    page.evaluate("lang3dxl.ask('windows')")
+    page.locator("#prompts summary").click()
+    page.locator("#prompts ol button").nth(1).wait_for()
+    until_linked(page, "ask=")
+    page.get_by_role("button", name="Walk").click()
+    until_linked(page, "walk=1")
+    stand = "lang3dxl.view.mover.address"
+    before = page.evaluate(f"[{stand}, history.state.step]")
+    page.locator("#prompts ol button").nth(1).click()  # flies to a thing, and no longer walks
+    until_linked(page, "thing=")
+    page.get_by_role("button", name="Hide the rest").click()
+    until_linked(page, "alone=1")
+    page.wait_for_timeout(500)
+    assert page.evaluate("history.state.step") == before[1] + 2
+    for name in ("Undo", "Redo", "Undo", "Undo"):
+        page.get_by_role("button", name=name).click()
+        until_linked(page, "alone=1", name == "Redo")
+        page.wait_for_timeout(500)  # a thing is chosen again once its word is answered: no step
+    until_linked(page, "thing=", False)
+    until(page, f"[{stand}, history.state.step]", before)
+    assert not page.get_by_role("button", name="Redo").is_disabled()
+    page.get_by_role("button", name="Walk").click()
+
+
+@pytest.mark.slow
 def test_of_two_addresses_the_later_one_is_shown(page):
     page.evaluate("location.hash = 'ask=windows&ask=wall&ask=belfry&not=sky'")
     page.evaluate("location.hash = 'ask=dome'")

@@ -21,9 +21,15 @@ QUESTIONS = [
     *("the big door on the left", "third window on the left"),
     *("how many windows are there?", "highest tower", "the third window from the left", "rose window"),
     *("windows left of the portal", "the window between the doors and gates", "count windows not doors"),
-    *("how many windows on the left tower", "doors below the window left of the largest dome", "left of it"),
+    *(
+        "how many windows are there on the left tower?",
+        "doors below the window left of the largest dome",
+        "left of it",
+    ),
     *("largest window above the portal", "2nd window from the top", "windows in front of all the towers"),
     *("second window from the right above the portal", "rightmost window on the right of the tower"),
+    *("how many windows are on the left tower?", "windows that are above the door", "how tall is the tower"),
+    *("Wie viele Fenster gibt es?", "what is this?", "biggest dome?", "windows which are old"),
     *("third window", "windows from the left", "windows between a and b and c", "", "why windows"),
     *(
         "how many windows are near the portal",
@@ -233,6 +239,10 @@ def test_questions_typed_into_the_page_are_answered_or_refused(page):
     told = page.evaluate("lang3dxl.ask('leftmost window').then(({ told }) => told)")
     assert told.startswith("window ")
     until(page, "document.querySelectorAll('#prompts ol button[aria-pressed=true]').length", 1)
+    told = page.evaluate("lang3dxl.ask('How many windows are below the left dome?').then(({ told }) => told)")
+    assert "windows" in told and "dome is searched for everywhere" in told  # which part wasn't used
+    page.evaluate("lang3dxl.ask('what is this?')")
+    assert page.locator("#here").is_visible() and "middle" in page.locator("#status").inner_text()
     refused = "lang3dxl.ask('how many windows near the dome').catch((error) => error.message)"
     assert "near" in page.evaluate(refused)
     page.evaluate("lang3dxl.clear()")

@@ -53,7 +53,7 @@ def test_kept_views_travel_in_the_link_and_play_in_order(browser, address):
         page.evaluate("document.getElementById('tour').open = true")
         for caption, word in STOPS:
             page.evaluate(f"lang3dxl.clear(); lang3dxl.ask('{word}').then(() => true)")
-            page.evaluate(f"lang3dxl.view.mover.address = '{len(stands)},0.2,-4,0,0,0,60'")
+            page.evaluate(f"lang3dxl.view.mover.goTo('{len(stands)},0.2,-4,0,0,0,60')")
             stands.append(page.evaluate("lang3dxl.view.mover.address"))
             page.click("#keep")
             page.keyboard.type(caption)

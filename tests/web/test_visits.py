@@ -172,6 +172,36 @@ def test_a_visit_by_touch_alone(browser, address):
 
 @pytest.mark.slow
 @SIZES
+def test_a_folded_panel_hides_nothing_that_is_told(browser, address, size):
+    seen = """(id) => {
+      const { left, top, right, bottom } = document.getElementById(id).getBoundingClientRect();
+      const hit = document.elementFromPoint((left + right) / 2, (top + bottom) / 2);
+      return Boolean(hit?.closest(`#${id}`)) && left >= 0 && right <= innerWidth; }"""
+    with visit(browser, address, size) as page:
+        page.get_by_role("button", name="Panel").click()
+        assert not page.locator("#status").is_visible() and not page.locator("#word").is_visible()
+        whole = page.evaluate("[document.getElementById('stage').clientWidth, innerWidth]")
+        assert whole[0] == whole[1]
+        page.evaluate("location.hash = 'ask=domme'")  # a word of a link, or of Back and Forward
+        until(page, f"({seen})('near')")
+        page.locator("#near").get_by_role("button").first.click()
+        until(page, "lang3dxl.prompts.length", 1)
+        page.locator("#frame").press("Enter")
+        until(page, f"({seen})('here')")
+        page.locator("#frame").press(".")
+        until(page, f"({seen})('status')")
+        assert not page.locator("#here").is_visible()  # it was told of another view
+        for _ in range(3):
+            page.locator("#frame").press("Escape")
+        until(
+            page,
+            "['status', 'near', 'here'].some((id) => document.getElementById(id).checkVisibility())",
+            False,
+        )
+
+
+@pytest.mark.slow
+@SIZES
 def test_forced_colors_keep_the_colors_that_tell_prompts_apart(browser, address, size):
     with visit(browser, address, size, forced_colors="active") as page:
         page.evaluate("lang3dxl.ask('dome; windows')")
@@ -197,3 +227,5 @@ def test_axe_finds_nothing(browser, address, axe, size):
         page.locator("#strip button").first.click()
         until(page, "document.getElementById('over').hidden", False)
         assert page.evaluate(run) == []
+        page.get_by_role("button", name="Panel").click()
+        assert page.locator("#status").is_visible() and page.evaluate(run) == []
