@@ -19,7 +19,7 @@ from lang3dxl_ns.query.question import Question
 from lang3dxl_ns.query.trust import FAR
 from lang3dxl_ns.rendering import composite
 from lang3dxl_ns.scene.camera import in_camera_frame
-from lang3dxl_ns.things.join import VIEWS, Joined, grown, join, stacked, without_crumbs
+from lang3dxl_ns.things.join import VIEWS, Joined, grown, join, placed, without_crumbs
 from lang3dxl_ns.things.pieces import FILLED, LEVELS, Piece, Shown, pieces_of
 from lang3dxl_ns.things.thing import Box, Sighting, Thing, upright_box
 
@@ -102,8 +102,8 @@ def things_of(scene: Answering, question: Question) -> list[Things]:
         values = question.relevancy[i].double().cpu().numpy()
         weight = np.sqrt(mass) * values
         boxed = partial(box, weight)
-        parts = join(pieces[i], weight, boxed)
-        joined = grown(stacked(parts, [boxed(part) for part in parts]), len(weight))
+        parts = grown(join(pieces[i], weight, boxed), len(weight))
+        joined = placed(parts, [boxed(part) for part in parts])
         sure = [one for one in without_crumbs(joined) if one.views >= VIEWS]
         listed = [_known(_thing(prompt.text, one, boxed(one), mass, values), known, mass)
                   for one in [*sure, *(one for one in joined if one not in sure)]]  # fmt: skip

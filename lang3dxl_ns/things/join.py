@@ -24,15 +24,22 @@ VIEWS = 2
 """Number of views that must show a thing: what a single one shows may be a smear."""
 CRUMB = 0.03
 """Weight, relative to the typical thing's (half of all weight is in heavier ones), below which a thing is a
-crumb of another, unless many views show it."""
-OFTEN = 5
-"""Number of views that show a thing from which it is no crumb, however small: a pinnacle beside a spire."""
-OVER = 0.6
+crumb of another, unless two photos show it clearly."""
+CLEAR = 1e-3
+"""Share of a photo that a thing fills in the second one of those that show most of it, from which it is no
+crumb, however light: a pinnacle beside a spire."""
+OVER = 0.4
 """Level distance of two things, relative to their summed widths, up to which one stands over the other."""
+OVERLAP = 0.05
+"""Intersection over union of two boxes from which they hold sides of one thing."""
 SLIM = 4.0
 """Height, relative to its width, from which a thing is one with what stands on or below it."""
 STRAIGHT = 1.5
 """Distance of the two from one plumb line, relative to the slim one's width, up to which they are one."""
+ROUND = 0.5
+"""Depth, relative to its width, from which a thing is one with what crowns it: a dome with its lantern."""
+CROWN = 0.5, 0.3
+"""Width of what crowns a thing, and its distance from the middle, relative to the thing's width, at most."""
 
 
 @dataclass(eq=False)
@@ -49,6 +56,14 @@ class Joined:
     def views(self) -> int:
         """Number of views that show it."""
         return len({piece.photo for piece in self.votes})
+
+    @property
+    def area(self) -> float:
+        """Share of the photo that it fills in the second one of those that show most of it; 0 with one."""
+        most = dict[str, float]()
+        for piece in self.votes:
+            most[piece.photo] = max(most.get(piece.photo, 0.0), piece.area)
+        return sorted([0.0, 0.0, *most.values()])[-2]
 
 
 def join(pieces: Sequence[Piece], weight: Float[Array, " n"], box: Callable[[Joined], Box]) -> list[Joined]:
@@ -123,16 +138,22 @@ def grown(things: Sequence[Joined], count: int) -> list[Joined]:
     return [replace(one, rows=order[a:b]) for one, (a, b) in parts if b > a + 1]
 
 
-def stacked(things: Sequence[Joined], boxes: Sequence[Box]) -> list[Joined]:
-    """Unite slim things with what stands on or below them: a minaret's shaft, its balcony and its tip.
-    `boxes` are the things' upright boxes."""
+def placed(things: Sequence[Joined], boxes: Sequence[Box]) -> list[Joined]:
+    """Unite things whose boxes overlap, slim things with what stands on or below them (a minaret's shaft, its
+    balcony and its tip), and deep things with what crowns them. `boxes` are the things' upright boxes."""
     pairs = []
     for a, (center, axes, size) in enumerate(boxes):
-        if size[2] < SLIM * size[:2].max():
-            continue
+        wide = size[:2].max()
         for b, (other, _, extent) in enumerate(boxes):
-            aside, high = np.linalg.norm(axes[:2] @ (other - center)), abs(axes[2] @ (other - center))
-            if a != b and aside < STRAIGHT * size[:2].max() and high < 1.5 * size[2] + extent[2] / 2:
+            *aside, high = axes @ (other - center)
+            gap = abs(high) - (size[2] + extent[2]) / 2
+            shared = np.minimum((size + extent) / 2 - abs(np.array([*aside, high])), np.minimum(size, extent))
+            common = shared.clip(0).prod()
+            overlap = common > OVERLAP * (size.prod() + extent.prod() - common)
+            slim = size[2] >= SLIM * wide and np.hypot(*aside) < STRAIGHT * wide and gap < size[2]
+            small = extent[:2].max() < CROWN[0] * wide and np.abs(aside).max() < CROWN[1] * wide
+            crown = small and size[:2].min() > ROUND * wide and high > 0 and gap < size[2]
+            if a != b and (overlap or slim or crown):
                 pairs.append((a, b))
     return _grouped(things, _groups(len(things), pairs))
 
@@ -150,9 +171,9 @@ def _grouped(things: Sequence[Joined], group: Int[Array, " n"]) -> list[Joined]:
 
 
 def without_crumbs(things: Sequence[Joined]) -> list[Joined]:
-    """Leave out the things that weigh far less than the typical one and that few views show."""
+    """Leave out the things that weigh far less than the typical one and that no two photos show clearly."""
     weights = np.sort([thing.weight for thing in things])[::-1]
     if not len(weights):
         return []
     typical = weights[np.searchsorted(weights.cumsum(), weights.sum() / 2)]
-    return [thing for thing in things if thing.weight >= CRUMB * typical or thing.views >= OFTEN]
+    return [thing for thing in things if thing.weight >= CRUMB * typical or thing.area >= CLEAR]

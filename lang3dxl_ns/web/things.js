@@ -5,7 +5,7 @@ import { fitted } from "./like.js";
 import { BLUR, spreadAt } from "./pick.js";
 import { seenAt } from "./space.js";
 
-const { LEVELS, PART, DEPTH, FILLED, SHARED, SPLINTER, VIEWS, CRUMB, OFTEN, OVER, OUTLIERS, COLORED, SAME, SLIM, STRAIGHT } = language.things;
+const { LEVELS, PART, DEPTH, FILLED, SHARED, SPLINTER, VIEWS, CRUMB, CLEAR, OVER, OVERLAP, OUTLIERS, COLORED, SAME, SLIM, STRAIGHT, ROUND, CROWN } = language.things;
 const SIDE = 240, LEAST = 3; // pixels of a view's longer side, and of the smallest piece
 const FAINT = 0.05, TRACE = 0.004, REACH = 2.5; // relevancy and heat that leave no trace, standard deviations that are drawn
 const RIDGE = 0.1, ROUNDS = 12; // strength of the colors' regularization, Newton steps
@@ -17,8 +17,8 @@ export function thingsOf(views, scene, relevancy) {
   const heat = sharpened(scene, relevancy), { mass } = scene;
   const weight = Float64Array.from(relevancy, (value, i) => Math.sqrt(mass[i]) * value);
   const box = ({ rows }) => uprightBox(rows, scene.centers, weight, scene.edges);
-  const parts = join(views.flatMap((view, v) => piecesOf(drawn(view, scene, heat), v)), weight, box);
-  const joined = grown(stacked(parts, parts.map(box)), weight.length);
+  const parts = grown(join(views.flatMap((view, v) => piecesOf(drawn(view, scene, heat), v)), weight, box), weight.length);
+  const joined = placed(parts, parts.map(box));
   const sure = new Set(withoutCrumbs(joined).filter((one) => photosOf(one).size >= VIEWS));
   const listed = (some) => some.map((one) => described(one, scene, weight, relevancy)).sort((a, b) => b.weight - a.weight);
   return { things: listed([...sure]), candidates: listed(joined.filter((one) => !sure.has(one))) };
@@ -149,7 +149,7 @@ export function piecesOf({ map, depth, width, height, rows, points, focal, scale
       (left = Math.min(left, x)), (top = Math.min(top, y)), (right = Math.max(right, x + 1)), (bottom = Math.max(bottom, y + 1));
     }
     const cut = left <= 1 || top <= 1 || right >= width - 1 || bottom >= height - 1;
-    return [{ view, rows: own[k], resolution: focal / middle, area: pixels.length, box: [left, top, right, bottom].map((side) => side / scale), cut }];
+    return [{ view, rows: own[k], resolution: focal / middle, area: pixels.length / map.length, box: [left, top, right, bottom].map((side) => side / scale), cut }];
   });
 }
 
@@ -251,15 +251,18 @@ export function grown(things, count) {
   return things.map((thing, t) => ({ ...thing, rows: own[t] })).filter(({ rows }) => rows.length > 1);
 }
 
-/** Unite slim things with what stands on or below them. boxes: the things' upright boxes. */
-export function stacked(things, boxes) {
-  const pairs = [];
+/** Unite things whose boxes overlap, slim ones with what stands on or below them, deep ones with what crowns them. */
+export function placed(things, boxes) {
+  const pairs = [], volume = (size) => size.reduce((all, side) => all * side, 1), wide = ([x, y]) => Math.max(x, y);
   boxes.forEach(({ center, axes, size }, a) => {
-    const wide = Math.max(size[0], size[1]);
-    if (size[2] < SLIM * wide) return;
+    const width = wide(size);
     boxes.forEach((other, b) => {
       const [x, y, high] = axes.map((axis) => axis.reduce((sum, value, k) => sum + value * (other.center[k] - center[k]), 0));
-      if (a !== b && Math.hypot(x, y) < STRAIGHT * wide && Math.abs(high) < 1.5 * size[2] + other.size[2] / 2) pairs.push([a, b]);
+      const common = volume([x, y, high].map((far, k) => Math.max(0, Math.min((size[k] + other.size[k]) / 2 - Math.abs(far), size[k], other.size[k]))));
+      const overlap = common > OVERLAP * (volume(size) + volume(other.size) - common), near = Math.abs(high) - (size[2] + other.size[2]) / 2 < size[2];
+      const slim = size[2] >= SLIM * width && Math.hypot(x, y) < STRAIGHT * width;
+      const small = wide(other.size) < CROWN[0] * width && wide([Math.abs(x), Math.abs(y)]) < CROWN[1] * width;
+      if (a !== b && (overlap || (near && (slim || (small && Math.min(size[0], size[1]) > ROUND * width && high > 0))))) pairs.push([a, b]);
     });
   });
   return grouped(things, pairs);
@@ -279,12 +282,19 @@ function grouped(things, pairs) {
   })); // prettier-ignore
 }
 
-/** Leave out the things that weigh far less than the typical one and that few views show. */
+/** Leave out the things that weigh far less than the typical one and that no two photos show clearly. */
 export function withoutCrumbs(things) {
   const weights = things.map(({ weight }) => weight).sort((a, b) => b - a), all = weights.reduce((sum, value) => sum + value, 0);
   let before = 0;
   const typical = weights.find((value) => (before += value) >= all / 2) ?? 0;
-  return things.filter((thing) => thing.weight >= CRUMB * typical || photosOf(thing).size >= OFTEN);
+  return things.filter((thing) => thing.weight >= CRUMB * typical || areaOf(thing) >= CLEAR);
+}
+
+/** Share of the photo that a thing fills in the second one of those that show most of it; 0 with one. */
+function areaOf({ votes }) {
+  const most = new Map();
+  for (const { view, area } of votes) most.set(view, Math.max(most.get(view) ?? 0, area));
+  return [0, 0, ...most.values()].sort((a, b) => a - b).at(-2);
 }
 
 /** Find the box around weighted Gaussians along axes, of which the last is up: { center, axes, size }. */

@@ -63,7 +63,7 @@ _SUGGESTED = (
 _NUMBERS = (
     ("ranking", view_ranking, "PEAK LARGE RIM STRONG"),
     ("things", pieces, "LEVELS PART DEPTH FILLED"),
-    ("things", join, "SHARED SPLINTER VIEWS CRUMB OFTEN OVER SLIM STRAIGHT"),
+    ("things", join, "SHARED SPLINTER VIEWS CRUMB CLEAR OVER OVERLAP SLIM STRAIGHT ROUND CROWN"),
     ("things", thing, "OUTLIERS"),
     ("things", find, "COLORED SAME SURE MISSED"),
     ("things", grammar, "BESIDE INSIDE CLOSE"),

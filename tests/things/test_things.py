@@ -19,7 +19,7 @@ from lang3dxl_ns.rendering import Camera, Rendering
 from lang3dxl_ns.scene.georeference import Georeference
 from lang3dxl_ns.things.find import Things, axes_of, heights_of, up_of
 from lang3dxl_ns.things.grammar import Request, Sight, answer, parse, sight_of, table, unsure
-from lang3dxl_ns.things.join import OFTEN, Joined, grown, join, stacked, without_crumbs
+from lang3dxl_ns.things.join import CLEAR, Joined, grown, join, placed, without_crumbs
 from lang3dxl_ns.things.pieces import Piece, Shown, pieces_of, split
 from lang3dxl_ns.things.thing import Thing, upright_box
 from lang3dxl_ns.things.write import outlined, write_catalog
@@ -125,13 +125,12 @@ def test_crumbs_go_and_equals_stay():
     assert without_crumbs([]) == []
 
 
-def test_many_views_tell_that_a_small_thing_is_no_crumb():
-    sizes = [np.arange(100), np.arange(100, 102), np.arange(102, 104)]
-    shown = [piece(str(v), rows, 1.0) for rows, n in zip(sizes, (2, OFTEN, OFTEN - 1), strict=True)
-             for v in range(n)]  # fmt: skip
+def test_two_photos_that_show_a_small_thing_clearly_tell_that_it_is_no_crumb():
+    shown = [piece("a", np.arange(100), 1.0)]
+    for rows, areas in (([100, 101], (2.0, 2.0)), ([102, 103], (9.0, 0.5, 0.5, 0.5)), ([104, 105], (9.0,))):
+        shown += [replace(piece(str(v), rows, 1.0), area=CLEAR * area) for v, area in enumerate(areas)]
     found = without_crumbs(joined(shown))
-    assert [len(one.rows) for one in found] == [100, 2]
-    assert 100 in found[1].rows
+    assert [one.rows.tolist() for one in found] == [list(range(100)), [100, 101]]
 
 
 @pytest.mark.parametrize("angle", [0.0, 0.3, 1.1, 2.0])
@@ -405,16 +404,22 @@ def test_a_count_allows_for_things_that_no_photo_shows_well(found, more, said):
     assert Things("window", each[:found], each[found:]).count == said
 
 
-def test_slim_things_are_one_with_what_stands_on_them_and_windows_in_tiers_are_not():
-    def joined(boxes):
+def test_things_are_one_where_their_boxes_overlap_or_one_stands_on_the_other():
+    def joined(*boxes):
         parts = [Joined(np.array([i]), 1.0, [piece("a", [i], 1.0)]) for i in range(len(boxes))]
-        placed = [(np.array((x, 0.0, z)), np.eye(3), np.array(size, float)) for x, z, size in boxes]
-        return sorted(sorted(one.rows.tolist()) for one in stacked(parts, placed))
+        placed_at = [(np.array((x, y, z)), np.eye(3), np.array(size, float)) for x, y, z, size in boxes]
+        return sorted(sorted(one.rows.tolist()) for one in placed(parts, placed_at))
 
-    shaft, tip, far = (0, 0, (1, 1, 9)), (0.5, 7, (1, 1, 2)), (0, 40, (1, 1, 2))
-    assert joined([shaft, tip, (9, 7, (1, 1, 2)), far]) == [[0, 1], [2], [3]]
-    assert joined([(0, 0, (1, 0.2, 2)), (0, 3, (1, 0.2, 2))]) == [[0], [1]]
-    assert joined([]) == []
+    shaft, tip, far = (0, 0, 0, (1, 1, 9)), (0.5, 0, 7, (1, 1, 2)), (0, 0, 40, (1, 1, 2))
+    assert joined(shaft, tip, (9, 0, 7, (1, 1, 2)), far) == [[0, 1], [2], [3]]
+    assert joined((0, 0, 0, (1, 0.2, 2)), (0, 0, 3, (1, 0.2, 2))) == [[0], [1]]  # windows in tiers
+    dome, side, lantern = (0, 0, 0, (4, 3, 2)), (1, 1, 0, (3, 4, 2)), (0.5, 0.5, 2, (1, 1, 1))
+    assert joined(dome, side, lantern) == [[0, 1, 2]]
+    assert joined(dome, (1.9, 1.9, 0, (0.5, 0.5, 2))) == [[0], [1]]  # a pinnacle that the box's corner holds
+    assert joined(dome, (1.5, 0, 2, (1, 1, 1))) == joined(dome, (0, 0, -2, (1, 1, 1))) == [[0], [1]]
+    assert joined(dome, (0, 0, 5, (1, 1, 1))) == joined(dome, (0, 0, 2.5, (3, 3, 2))) == [[0], [1]]
+    assert joined((0, 0, 0, (4, 1, 2)), (0, 0, 2, (1, 1, 1))) == [[0], [1]]  # above a wide window
+    assert joined() == []
 
 
 def test_counts_are_doubtful_where_the_answer_or_the_scene_is():

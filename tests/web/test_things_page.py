@@ -12,7 +12,7 @@ from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.query.trust import FAR
 from lang3dxl_ns.things.find import Things
 from lang3dxl_ns.things.grammar import Sight, answer, parse, unsure
-from lang3dxl_ns.things.join import Joined, grown, join, stacked, without_crumbs
+from lang3dxl_ns.things.join import Joined, grown, join, placed, without_crumbs
 from lang3dxl_ns.things.pieces import LEAST, Piece, split
 from lang3dxl_ns.things.thing import Thing, upright_box
 from lang3dxl_ns.web.write_page import Page, write_page
@@ -146,7 +146,8 @@ def test_pieces_join_as_in_python(page):
             wide = rng.choice([8, 16, 18, 38])
             rows = np.unique(rng.integers(start, min(start + wide, 200), 30))
             cut = bool(rng.random() < 0.1)
-            pieces.append(Piece(str(view), rows, float(rng.random()), len(rows), (0, 0, 1, 1), cut))
+            area = float(rng.uniform(0, 2e-3))
+            pieces.append(Piece(str(view), rows, float(rng.random()), area, (0, 0, 1, 1), cut))
     weight, points = rng.random(400), rng.random((400, 3))
     # Two that photos have in one piece, and another in two, are one where one stands over the other.
     for start in range(200, 400, 10):
@@ -156,14 +157,14 @@ def test_pieces_join_as_in_python(page):
         shown += [("4", [*spire, *pinnacle]), ("5", [*spire, *other]), ("5", pinnacle)]
         for photo, rows in shown:
             fine = 9.0 if photo < "3" else 0.5
-            pieces.append(Piece(photo, np.array(rows), fine, len(rows), (0, 0, 1, 1), False))
+            pieces.append(Piece(photo, np.array(rows), fine, 1e-3, (0, 0, 1, 1), False))
 
     def box(one: Joined):
         return upright_box(points[one.rows], weight[one.rows], np.eye(3))
 
     expected = grown(without_crumbs(join(pieces, weight, box)), 400)
-    given = [{"view": int(p.photo), "rows": p.rows.tolist(), "resolution": p.resolution, "cut": p.cut}
-             for p in pieces]  # fmt: skip
+    given = [{"view": int(p.photo), "rows": p.rows.tolist(), "resolution": p.resolution, "area": p.area,
+              "cut": p.cut} for p in pieces]  # fmt: skip
     body = """const edges = [[1, 0, 0], [0, 1, 0], [0, 0, 1]];
       const box = ({ rows }) => m.uprightBox(rows, given.points, given.weight, edges);
       return m.grown(m.withoutCrumbs(m.join(given.pieces, given.weight, box)), 400).map(
@@ -175,14 +176,16 @@ def test_pieces_join_as_in_python(page):
     assert sorted(found) == sorted([sorted(one.rows.tolist()), one.views] for one in expected)
 
 
-def test_slim_things_join_with_what_stands_on_them_as_in_python(page):
+@pytest.mark.parametrize(
+    ("least", "most"),
+    [((0.3, 0.3, 0.3), (0.6, 0.6, 4)), ((0.8, 0.8, 0.8), (2, 2, 1)), ((0.2,) * 3, (4, 4, 1))],
+)
+def test_things_join_with_those_on_or_around_them_as_in_python(page, least, most):
     rng = np.random.default_rng(4)
     count = 40
-    boxes = [
-        (rng.uniform(0, 9, 3), np.eye(3), rng.uniform((0.3, 0.3, 0.3), (0.6, 0.6, 4))) for _ in range(count)
-    ]
+    boxes = [(rng.uniform(0, 9, 3), np.eye(3), rng.uniform(least, most)) for _ in range(count)]
     parts = [Joined(np.array([i]), 1.0, []) for i in range(count)]
-    expected = sorted(sorted(one.rows.tolist()) for one in stacked(parts, boxes))
+    expected = sorted(sorted(one.rows.tolist()) for one in placed(parts, boxes))
     assert 5 < len(expected) < count
     given = {
         "parts": [{"rows": [i], "weight": 1, "votes": []} for i in range(count)],
@@ -190,7 +193,7 @@ def test_slim_things_join_with_what_stands_on_them_as_in_python(page):
             dict(zip(("center", "axes", "size"), map(np.ndarray.tolist, box), strict=True)) for box in boxes
         ],
     }
-    body = "return m.stacked(given.parts, given.boxes).map(({ rows }) => rows.toSorted((a, b) => a - b));"
+    body = "return m.placed(given.parts, given.boxes).map(({ rows }) => rows.toSorted((a, b) => a - b));"
     assert sorted(module(page, "things", body, given)) == expected
 
 
