@@ -8,7 +8,7 @@ from pathlib import Path
 
 import tyro
 
-from lang3dxl_ns.common.console import say
+from lang3dxl_ns.common.console import say, some
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.settings_help import showing
 
@@ -38,6 +38,7 @@ class ListThings:
 
     def main(self) -> None:
         from lang3dxl_ns.open_scene import load_scene
+        from lang3dxl_ns.query.text import caution
         from lang3dxl_ns.things.grammar import answer, parse, sight_of, unsure
         from lang3dxl_ns.things.write import write_catalog, write_picture, write_things
 
@@ -54,6 +55,8 @@ class ListThings:
         by_word = dict(zip(words, answers, strict=True)) if len(answers) == len(words) else {}
         for one in answers:
             say(f"{one.word}: {one.count}" + (f" ({one.caution})" if one.caution else ""))
+            if one.word not in scene.words and (advice := caution(one.word)):
+                say(f"  {advice}")
         for text, request in requests:
             if not by_word:
                 raise UserError("--text holds several prompts: repeat the flag instead")
@@ -62,10 +65,10 @@ class ListThings:
             chosen = answer(request, named, sight)
             whole = request.count and not (request.relation or request.without)
             told = by_word[request.word].count if whole else str(len(chosen))
-            listed = ", ".join(f"{t.word} {t.id}, best seen in {t.sightings[0].photo}" for t in chosen)
+            if chosen and not request.count:
+                told += ": " + some([f"{thing.id} in {thing.sightings[0].photo}" for thing in chosen])
             doubt = None if whole else unsure(request, named, sight)  # the range of a count tells it
-            note = f" (unsure, since {doubt})" if doubt else ""
-            say(f"{text}: {told if request.count else listed or 'none found'}{note}")
+            say(f"{text}: {told}" + (f" (unsure, since {doubt})" if doubt else ""))
         if self.out is not None:
             write_catalog(scene, answers, self.out)
             write_picture(scene, answers, self.out / "things.png")
