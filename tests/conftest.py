@@ -24,7 +24,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from runs import make_trainer
+from runs import train_run
 from scenes import write_scene
 from tiny_models import make_tiny_clip, make_tiny_dinov2
 
@@ -133,10 +133,7 @@ def two_steps(tmp_path_factory, tiny_clip, tiny_dense):
     """The trainer of a finished run of two steps, whose files tests may damage copies of."""
     root = tmp_path_factory.mktemp("run")
     data = write_scene(root / "scene", photos=4, points=60)
-    trainer = make_trainer(data, tiny_clip, tiny_dense, root / "outputs", iterations=2)
-    trainer.setup()
-    trainer.train()
-    return trainer
+    return train_run(data, tiny_clip, tiny_dense, root / "outputs", iterations=2)
 
 
 @pytest.fixture
@@ -145,10 +142,7 @@ def train(tiny_clip, tiny_dense, tmp_path):
 
     def run(data: Path, iterations: int = 40, output_dir: Path = tmp_path, semantics: bool = True, **changes):
         """`changes` are set by their dotted path, with __ for each dot."""
-        trainer = make_trainer(data, tiny_clip, tiny_dense, output_dir, iterations, semantics, **changes)
-        trainer.setup()
-        trainer.train()
-        return trainer
+        return train_run(data, tiny_clip, tiny_dense, output_dir, iterations, semantics, **changes)
 
     return run
 

@@ -26,6 +26,10 @@ DOME = (1.0, 2.0, 1.0, 2.0)
 """x from, to, y from, to."""
 WINDOWS = ((-2.0, -1.6, -1.0, -0.6), (-1.0, -0.6, -1.0, -0.6))
 CHANNELS = 16
+TICKS = 8
+"""Gaussians along a unit of the wall: a browser without a GPU takes a second to draw 40,000."""
+COUNT = (6 * TICKS) ** 2 + 1
+"""Gaussians of the scene."""
 
 
 def features() -> Tensor:
@@ -53,16 +57,16 @@ def word_at(points: Tensor) -> Tensor:
     return words
 
 
-def painted_gaussians() -> dict[str, Tensor]:
-    """A Gaussian for each twelfth of a unit of the wall, and one behind it that no camera sees."""
-    ticks = (torch.arange(72) + 0.5) / 12 - 3
+def painted_gaussians(along: int = TICKS) -> dict[str, Tensor]:
+    """Gaussians on a grid over the wall, and one behind it that no camera sees."""
+    ticks = (torch.arange(6 * along) + 0.5) / along - 3
     plane = torch.cartesian_prod(ticks, ticks)
     means = torch.cat([F.pad(plane, (0, 1)), torch.tensor([[0.0, 0.0, -50.0]])])
     count = len(means)
     return {
         "means": means,
         "quats": torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(count, 1),
-        "scales": torch.tensor([[0.035, 0.035, 0.001]]).log().repeat(count, 1),
+        "scales": torch.tensor([[0.42 / along, 0.42 / along, 0.001]]).log().repeat(count, 1),
         "opacities": torch.full((count, 1), 4.0),
         "features_dc": torch.zeros(count, 3),
         "features_rest": torch.zeros(count, 15, 3),
@@ -70,9 +74,9 @@ def painted_gaussians() -> dict[str, Tensor]:
     }
 
 
-def painted_splats() -> Splats:
+def painted_splats(along: int = TICKS) -> Splats:
     """Gray for walls, brighter for every further word."""
-    g = painted_gaussians()
+    g = painted_gaussians(along)
     colors = (g["words"][:, None] / 3.0).expand(-1, 3)
     return Splats(
         g["means"], g["quats"], g["scales"].exp(), g["opacities"].sigmoid().squeeze(1), harmonics_of(colors)
@@ -92,8 +96,8 @@ class Painted(Decoder):
         return rendered, None
 
 
-def painted_codes() -> Tensor:
-    rows = features()[painted_gaussians()["words"]]
+def painted_codes(along: int = TICKS) -> Tensor:
+    rows = features()[painted_gaussians(along)["words"]]
     rows[-1] = torch.nan  # nobody has seen it
     return rows
 

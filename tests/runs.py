@@ -46,3 +46,11 @@ def make_trainer(data, clip, dense, output_dir, iterations, semantics=True, meth
     config.set_timestamp()
     config.save_config()
     return config.setup(local_rank=0, world_size=1)
+
+
+def train_run(*given, **changes):
+    """The trainer of a finished run, configured as by `make_trainer`."""
+    trainer = make_trainer(*given, **changes)
+    trainer.setup()
+    trainer.train()
+    return trainer

@@ -34,14 +34,12 @@ def on_eight_threads() -> None:
 
 
 def of_large_photos(folder, clip, dense) -> None:
-    from runs import make_trainer
+    from runs import train_run
     from scenes import write_scene
 
     data = write_scene(folder / "scene", photos=3, points=200, size=(4000, 3000), coarseness=4)
     scale = {"pipeline__datamanager__camera_res_scale_factor": 0.4}
-    trainer = make_trainer(data, clip, dense, folder / "runs", 3, **scale)
-    trainer.setup()
-    trainer.train()
+    trainer = train_run(data, clip, dense, folder / "runs", 3, **scale)
     assert trainer.pipeline.model.gauss_params["codes"].isfinite().any()
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss < 4e9 / 1024
 

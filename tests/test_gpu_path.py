@@ -188,13 +188,15 @@ def test_code_maps_are_decoded_at_five_sizes(default):
     assert (min(sizes), max(sizes)) == model.config.decode_size
 
 
-@pytest.mark.parametrize("name", BASELINES)
+@pytest.mark.parametrize(
+    "name", [name if name == "fmgs" else pytest.param(name, marks=pytest.mark.nightly) for name in BASELINES]
+)
 def test_every_decoder_trains(trained, name, monkeypatch):
     monkeypatch.setattr(langsplat, "_STEPS", 5)
     trained(2, pipeline__model__decoder__name=name, pipeline__model__densify_until=0.0)
 
 
-@pytest.mark.parametrize("preset", ["official", "paper"])
+@pytest.mark.parametrize("preset", ["official", pytest.param("paper", marks=pytest.mark.nightly)])
 def test_every_preset_of_the_field_trains(trained, preset):
     field = {"preset": preset, "log2_table_size": 12}  # half a million entries a level take seconds to save
     changes = {f"pipeline__model__semantic_field__{name}": value for name, value in field.items()}

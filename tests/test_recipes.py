@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from painted_scene import DISTANCE, DOME, painted_gaussians, painted_scene
+from painted_scene import COUNT, DISTANCE, painted_gaussians, painted_scene
 from PIL import Image
 from runs import fitted
 
@@ -37,16 +37,8 @@ def test_all_recipes_run_on_a_run_trained_by_the_suite(scene, tiny_clip, tiny_de
         exec(code, names)
 
 
-def test_there_are_ten_recipes_and_more():
-    assert len(RECIPES) == 11
-
-
 def test_1_a_scene_says_what_it_is(after):
-    assert repr(after[1]["scene"]).startswith("Scene(5,185 Gaussians, 4 photos (1 held out)")
-
-
-def test_2_poses_are_arrays(after):
-    assert after[2]["photo"].pose.shape == (4, 4)
+    assert repr(after[1]["scene"]).startswith(f"Scene({COUNT:,} Gaussians, 4 photos (1 held out)")
 
 
 def test_3_a_rendering_has_the_requested_size(after):
@@ -69,11 +61,6 @@ def test_5_a_match_is_saved_as_picture_and_as_numbers(after):
     np.testing.assert_array_equal(np.asarray(Image.open("dome.png")), match.overlay())
 
 
-def test_6_the_chosen_view_shows_the_word(after):
-    match = after[6]["match"]
-    assert match.view.name == "right/0002.jpg" and match.score > 0.5
-
-
 def test_7_each_word_has_its_color(after):
     matches = after[7]["matches"]
     picture = np.asarray(Image.open("words.png")).astype(int)
@@ -85,19 +72,6 @@ def test_7_each_word_has_its_color(after):
 
 def test_8_a_higher_threshold_leaves_less(after):
     assert after[8]["sure"].threshold >= 0.6 and after[8]["sure"].mask.any()
-
-
-def test_9_the_box_is_where_the_dome_is(after):
-    box = after[9]["found"].box
-    expected = np.array([DOME[0], DOME[2], 0.0, DOME[1], DOME[3], 0.0])
-    np.testing.assert_allclose([*box.low, *box.high], expected, atol=0.15)
-
-
-def test_10_the_gaussians_that_match_are_the_domes(after):
-    count = int((painted_gaussians()["words"] == 1).sum())
-    assert len(after[10]["domes"]) == count
-    assert f"element vertex {count}\n".encode() in Path("dome.ply").read_bytes()
-    assert b"element vertex 5185\n" in Path("all.ply").read_bytes()
 
 
 def test_11_vectors_and_features_agree_with_words(after):

@@ -85,7 +85,7 @@ def _axes(points: Float[Array, "n 3"]) -> list[tuple[Float[Array, "3"], float]]:
     points = np.random.default_rng(0).permutation(points)[:_POINTS]
     normals, weights = _normals(points)
     starts = [_settled(normals, weights, turn) for turn in Rotation.random(_STARTS, 0).as_matrix()]
-    axes = max(starts, key=lambda axes: float(weights[_cosines(normals, axes).max(1) > 0.95].sum()))
+    axes = max(starts, key=lambda axes: float(weights[np.abs(normals @ axes.T).max(1) > 0.95].sum()))
     return [_refined(normals, weights, axis) for axis in axes]
 
 
@@ -96,10 +96,6 @@ def _normals(points: Float[Array, "n 3"]) -> tuple[Float[Array, "n 3"], Float[Ar
     spread, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", near, near))
     flat = np.clip(1 - spread[:, 0] / np.maximum(spread[:, 1], 1e-12), 0, 1)
     return axes[:, :, 0], flat**2
-
-
-def _cosines(normals: Float[Array, "n 3"], axes: Float[Array, "k 3"]) -> Float[Array, "n k"]:
-    return np.abs(normals @ axes.T)
 
 
 def _settled(

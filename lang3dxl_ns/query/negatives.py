@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from functools import lru_cache
 
 from lang3dxl_ns.query.relevancy import CANONICAL
 
@@ -63,9 +64,10 @@ def competitors(phrases: Sequence[str], words: Sequence[str]) -> list[int]:
     return chosen or list(range(len(phrases)))
 
 
-def _meanings(phrase: str) -> set[str]:
+@lru_cache(1024)
+def _meanings(phrase: str) -> frozenset[str]:
     own = [form for word in _words(phrase) for form in singulars(word)]
-    return {*own, *(word for form in own for word in _NAMED.get(form, ()))}
+    return frozenset(own).union(*map(alternatives, own))
 
 
 def _words(text: str) -> list[str]:

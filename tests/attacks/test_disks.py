@@ -15,7 +15,6 @@ import torch
 from lang3dxl_ns.cli import main
 from lang3dxl_ns.common import files
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.common.files import slugs
 from lang3dxl_ns.open_scene import load_scene
 from lang3dxl_ns.plugin.trainer import _disk_kept_out_of_training, writer
 from lang3dxl_ns.preparation import workers
@@ -142,12 +141,6 @@ def test_a_file_is_no_folder_and_a_folder_no_file(tmp_path):
 def test_a_store_that_can_be_none_is_one_line(place):
     with pytest.raises(UserError, match="cache-dir DIR"):
         FeatureStore(Path(place)).make_folder()
-
-
-def test_folders_of_prompts_never_collide():
-    for texts in (["a", "a 3", "A!"], ["a", "a", "a-2", "a 3"], ["!", "text-1", "?"], ["x"] * 5):
-        assert len(set(slugs(texts))) == len(texts)
-    assert slugs(["rose window", "dome"]) == ["rose-window", "dome"]
 
 
 def test_sizes_are_told_in_a_unit_that_shows_them():

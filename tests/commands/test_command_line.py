@@ -11,10 +11,9 @@ import pytest
 
 from lab.landmark.demo import Demo
 from lang3dxl_ns import cli
-from lang3dxl_ns.commands.query import file_names, parse_texts
+from lang3dxl_ns.commands.query import file_names
 from lang3dxl_ns.common.console import accept_any_console
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.query.text import Prompt
 
 
 def shell(line: str, **environment: str) -> subprocess.CompletedProcess:
@@ -97,11 +96,6 @@ def test_a_port_that_is_taken_is_not_replaced_silently():
         pytest.raises(SystemExit, match="is taken by another program"),
     ):
         cli.main(["view", "none", "--port", str(server.getsockname()[1])])
-
-
-def test_negatives_for_all_texts():
-    (first, second) = parse_texts(['"dome" not "roof"; tower'], ["sky"])
-    assert first == Prompt("dome", ("roof", "sky")) and second == Prompt("tower", ("sky",))
 
 
 def test_a_photo_with_a_very_long_name_still_has_files():

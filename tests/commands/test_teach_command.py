@@ -27,7 +27,7 @@ from lang3dxl_ns.files.scene_file import (
     write_scene,
 )
 from lang3dxl_ns.open_scene import find_scene_file
-from lang3dxl_ns.words.taught_words import Example, load_words, mask_of, run_lengths
+from lang3dxl_ns.words.taught_words import load_words, mask_of, run_lengths
 
 DOME = "61,61,77,77"
 """Box of the dome in all/0003.jpg, a little large."""
@@ -133,12 +133,6 @@ def test_numbers_of_examples_are_those_of_the_list_however_many_are_forgotten(pl
 def test_a_negative_of_no_text_is_told(place, tmp_path):
     with pytest.raises(SystemExit, match="--not is a negative of texts"):
         main(["export", str(place), "--not", "window", "--out", str(tmp_path / "a.ply")])
-
-
-def test_evaluate_takes_a_scene_or_the_folder_that_holds_it(place):
-    for given in (place, place.parent):
-        with pytest.raises(SystemExit, match=r"wall\.scene is scored with --ground-truth"):
-            main(["evaluate", "run", str(given), "--out", str(place.parent / "report")])
 
 
 def test_words_are_not_saved_over_a_scene(place):
@@ -306,18 +300,6 @@ def test_a_word_with_a_slash_and_a_number_can_be_forgotten(place):
     assert not words(place)
 
 
-def test_a_word_taught_meanwhile_is_kept(place, monkeypatch):
-    def slow(self):
-        monkeypatch.undo()
-        monkeypatch.setattr("lang3dxl_ns.query.scene.text_encoder", lambda file, device: encode_texts)
-        main(["teach", str(place), "--word", "other", "--photo", "0003.jpg", "--box", DOME])
-        return Example("0003.jpg", box=(61, 61, 77, 77))
-
-    monkeypatch.setattr(Teach, "_example", slow)
-    teach(place)
-    assert words(place).keys() == {"gizmo", "other"}
-
-
 @pytest.mark.parametrize("name", ['"a" not "b"', "“dome”", " ; "])
 def test_a_name_that_no_prompt_means_is_refused_before_anything_is_written(place, name):
     before = place.read_bytes()
@@ -330,11 +312,6 @@ def test_clicks_have_no_average_precision(place, capsys):
     teach(place, "--at", "69,69", "--at", "68,70")
     said = capsys.readouterr().out
     assert "2 points in" in said and "average precision" not in said
-
-
-def test_forgetting_what_was_not_taught_is_one_sentence(place):
-    with pytest.raises(SystemExit, match="was not taught"):
-        main(["words", str(place), "--forget", "dome"])
 
 
 def test_run_lengths_return_the_mask():

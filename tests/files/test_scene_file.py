@@ -11,6 +11,7 @@ import pytest
 import torch
 from painted_scene import (
     CHANNELS,
+    COUNT,
     encode_texts,
     painted_file,
     painted_gaussians,
@@ -31,7 +32,6 @@ from lang3dxl_ns.files.scene_file import Provenance, describe_scene_file, read_s
 from lang3dxl_ns.files.splat_file import write_splats
 from lang3dxl_ns.query.relevancy import TEMPERATURE
 from lang3dxl_ns.query.scene import Scene
-from lang3dxl_ns.words.taught_words import Example
 
 ATOL = 1e-4 * TEMPERATURE
 """Of relevancies, whose slope is a quarter of the temperature: files hold half the digits."""
@@ -126,7 +126,7 @@ def test_a_gaussian_of_one_color_takes_at_most_48_bytes(tmp_path):
 def test_the_file_tells_what_it_is_without_paths_of_its_machine(written, tmp_path):
     scene, path = written
     told = describe_scene_file(path)
-    assert told["provenance"].credit == "Painters" and told["gaussians"] == 5185 and told["photos"] == 4
+    assert told["provenance"].credit == "Painters" and told["gaussians"] == COUNT and told["photos"] == 4
     scene.file.photos[0] = replace(scene.file.photos[0], mask=str(tmp_path / "somewhere" / "mask.png"))
     file = replace(scene.file, data="/home/somebody/wall")
     scene = painted_scene(file=file, decoder=scene.decoder, codes=scene.codes)
@@ -140,7 +140,7 @@ def test_info_takes_a_file_or_the_folder_that_holds_it(written, capsys):
     for place in (path, path.parent):
         Info(scene=place).main()
         told.append(capsys.readouterr().out)
-    assert told[0] == told[1] and "5,185" in told[0] and "Painters" in told[0]
+    assert told[0] == told[1] and f"{COUNT:,}" in told[0] and "Painters" in told[0]
 
 
 def test_foregrounds_travel_with_the_scene(tmp_path):
@@ -237,6 +237,13 @@ def test_tensors_of_wrong_shapes_are_refused(written, name):
         read_scene(path, "cpu")
 
 
+def altered(path, change):
+    """The file with other tensors."""
+    with safe_open(path, "np") as file:
+        tensors, metadata = {key: file.get_tensor(key) for key in file.keys()}, file.metadata()  # noqa: SIM118
+    path.write_bytes(save(change(tensors), metadata))
+
+
 @pytest.mark.parametrize(
     ("name", "rows", "said"),
     [
@@ -248,20 +255,15 @@ def test_tensors_of_wrong_shapes_are_refused(written, name):
 )
 def test_a_scene_without_numbers_is_refused_rather_than_answered_with_0(written, name, rows, said):
     _, path = written
-    with safe_open(path, "np") as file:
-        tensors, metadata = {key: file.get_tensor(key) for key in file.keys()}, file.metadata()  # noqa: SIM118
-    tensors[name] = tensors[name].copy()
-    tensors[name][rows] = np.nan
-    path.write_bytes(save(tensors, metadata))
+
+    def spoiled(tensors):
+        tensors[name] = tensors[name].copy()
+        tensors[name][rows] = np.nan
+        return tensors
+
+    altered(path, spoiled)
     with pytest.raises(UserError, match=rf"wall\.scene is not a readable scene \({said}\)"):
         read_scene(path, "cpu")
-
-
-def altered(path, change):
-    """The file with other tensors."""
-    with safe_open(path, "np") as file:
-        tensors, metadata = {key: file.get_tensor(key) for key in file.keys()}, file.metadata()  # noqa: SIM118
-    path.write_bytes(save(change(tensors), metadata))
 
 
 def test_codes_of_another_width_and_a_scene_of_nothing_are_refused(written):
@@ -277,29 +279,15 @@ def test_codes_of_another_width_and_a_scene_of_nothing_are_refused(written):
         read_scene(path, "cpu")
 
 
-def test_a_scene_without_training_photos_answers_where_it_is_asked(written):
-    _, path = written
-    rewritten(path, lambda told, _: [photo.update(split="eval") for photo in told["scene"]["photos"]])
-    scene = read_scene(path, "cpu", encode_texts=encode_texts)
-    assert scene.find("dome").views == [] and scene.query("dome", scene.photos[0].name).relevancy.any()
-    with pytest.raises(UserError, match="no training photos to choose from"):
-        scene.query("dome")
-    taught = scene.teach("gizmo", Example(scene.photos[0].name, points=((48, 48),)))
-    with pytest.raises(UserError, match="no training photos to choose from"):
-        taught.unsure("gizmo")
-
-
 @pytest.mark.parametrize("size", [30_000, 24])
 def test_a_mask_that_is_damaged_or_would_fill_the_memory_is_refused(written, size):
     _, path = written
-    with safe_open(path, "np") as file:
-        tensors, metadata = {key: file.get_tensor(key) for key in file.keys()}, file.metadata()  # noqa: SIM118
     picture = io.BytesIO()
     Image.new("1", (size, size)).save(picture, "PNG")
-    tensors["mask.0"] = np.frombuffer(picture.getvalue(), np.uint8).copy()
+    mask = np.frombuffer(picture.getvalue(), np.uint8).copy()
     if size < 100:
-        tensors["mask.0"][-20] ^= 1
-    path.write_bytes(save(tensors, metadata))
+        mask[-20] ^= 1
+    altered(path, lambda tensors: tensors | {"mask.0": mask})
     with pytest.raises(UserError, match=r"wall\.scene is not a readable scene \((Image size|broken PNG)"):
         read_scene(path, "cpu")
 

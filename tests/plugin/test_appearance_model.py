@@ -6,7 +6,7 @@ import pytest
 import torch
 from looks import in_look
 from nerfstudio.utils.eval_utils import eval_setup
-from runs import make_trainer
+from runs import make_trainer, train_run
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.plugin.model import Lang3DXLModel
@@ -27,10 +27,7 @@ def train(train):
 def lit(scene, tiny_clip, tiny_dense, tmp_path_factory):
     """A finished run with appearance and without semantics, to look at."""
     folder = tmp_path_factory.mktemp("lit")
-    trainer = make_trainer(scene, tiny_clip, tiny_dense, folder, 20, semantics=False, **{USE: "on"})
-    trainer.setup()
-    trainer.train()
-    return trainer
+    return train_run(scene, tiny_clip, tiny_dense, folder, 20, semantics=False, **{USE: "on"})
 
 
 def step_camera(trainer, index=0):

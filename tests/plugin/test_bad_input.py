@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from PIL import Image
 from processes import Process
-from runs import make_trainer
+from runs import train_run
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.plugin.pipeline import print_user_errors_plainly
@@ -26,10 +26,7 @@ def start(tiny_clip, tiny_dense, tmp_path):
 
     def run(data, semantics=True, iterations=2, **changes):
         folder = tmp_path / "out"
-        trainer = make_trainer(data, tiny_clip, tiny_dense, folder, iterations, semantics, **changes)
-        trainer.setup()
-        trainer.train()
-        return trainer
+        return train_run(data, tiny_clip, tiny_dense, folder, iterations, semantics, **changes)
 
     return run
 
@@ -37,12 +34,6 @@ def start(tiny_clip, tiny_dense, tmp_path):
 def test_no_such_folder(start, tmp_path):
     with pytest.raises(UserError, match="nowhere is not a folder"):
         start(tmp_path / "nowhere")
-
-
-def test_a_named_colmap_model_that_is_not_there(start, folder):
-    shutil.rmtree(folder / "sparse")
-    with pytest.raises(UserError, match="no COLMAP model"):
-        start(folder, pipeline__datamanager__dataparser__colmap_path=Path("elsewhere"))
 
 
 def test_a_misspelled_colmap_model_is_not_replaced_by_another(start, folder):

@@ -71,13 +71,6 @@ def test_a_run_whose_model_is_gone_gets_no_other_one(walk, tmp_path):
     assert not (data / "sparse").exists()
 
 
-def test_a_model_that_was_named_is_not_replaced_by_another(walk, tmp_path):
-    data = shutil.copytree(walk, tmp_path / "data")
-    named = PhotoCollectionDataParserConfig(data=data, colmap_path=Path("mine/0"))
-    assert parser_for(named, None, True).colmap_path == Path("mine/0")
-    assert not (data / "sparse").exists()
-
-
 def test_the_model_of_other_photos_in_a_shared_cache_is_not_used(walk, tmp_path):
     """Their names are the same. A read-only folder's model lies in the cache."""
     data, work = shutil.copytree(walk, tmp_path / "data"), tmp_path / "cache" / "reconstruction"
@@ -202,14 +195,6 @@ def test_a_videos_place_may_have_a_percent_sign(tmp_path):
     subprocess.run(["ffmpeg", "-v", "error", *graph, str(video)], check=True)
     frames = extract_frames(video)
     assert frames.parent == video.parent and len(list((frames / "images").iterdir())) == 2
-
-
-@needs_ffmpeg
-def test_what_is_no_video_is_an_error(tmp_path):
-    (tmp_path / "a.mp4").write_bytes(b"no video")
-    with pytest.raises(UserError, match=r"a\.mp4 is not a video.*: copy it again, or convert it") as told:
-        extract_frames(tmp_path / "a.mp4")
-    assert "\n" not in str(told.value)
 
 
 def test_a_video_without_ffmpeg_is_an_error_that_names_it(tmp_path, monkeypatch):

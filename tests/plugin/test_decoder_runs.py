@@ -5,7 +5,7 @@ from functools import cache
 import pytest
 import torch
 from nerfstudio.utils.eval_utils import eval_setup
-from runs import make_trainer
+from runs import train_run
 
 from lab.baselines import BASELINES, langsplat
 from lang3dxl_ns.components.compression import CompressionConfig
@@ -36,10 +36,7 @@ def runs(scene, tiny_clip, tiny_dense, tmp_path_factory):
         if not dense:
             changes["pipeline__datamanager__dense"] = "none"
         folder = tmp_path_factory.mktemp(name)
-        trainer = make_trainer(scene, tiny_clip, tiny_dense, folder, 6, semantics, **changes)
-        trainer.setup()
-        trainer.train()
-        return trainer
+        return train_run(scene, tiny_clip, tiny_dense, folder, 6, semantics, **changes)
 
     return made
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 from label_sets import box_object, write_labels, write_plain
 from PIL import Image
-from runs import make_trainer
+from runs import train_run
 from scenes import write_scene
 
 from lang3dxl_ns import cli
@@ -39,10 +39,7 @@ def label(scene, folder, numbers):
 @pytest.fixture(scope="module")
 def trainer(scene, tiny_clip, tiny_dense, tmp_path_factory):
     """A finished run of two steps, to evaluate."""
-    trainer = make_trainer(scene, tiny_clip, tiny_dense, tmp_path_factory.mktemp("run"), iterations=2)
-    trainer.setup()
-    trainer.train()
-    return trainer
+    return train_run(scene, tiny_clip, tiny_dense, tmp_path_factory.mktemp("run"), iterations=2)
 
 
 @pytest.fixture
@@ -86,9 +83,7 @@ def test_ns_eval_reports_pictures_features_words_and_cost(evaluate, scene, tmp_p
 def test_a_lens_that_distorts_is_not_counted_as_masks(tmp_path, tiny_clip):
     """Undistorted photos have pixels without content at their border, which are masked as well."""
     folder = write_scene(tmp_path / "bent", distortion=(0.3, 0.1, 0.0, 0.0))
-    trainer = make_trainer(folder, tiny_clip, "none", tmp_path / "run", iterations=2)
-    trainer.setup()
-    trainer.train()
+    trainer = train_run(folder, tiny_clip, "none", tmp_path / "run", iterations=2)
     pipeline = trainer.pipeline
     pipeline.config.ground_truth = label(folder, tmp_path / "truth", range(6))
     results = pipeline.get_average_eval_image_metrics(get_std=True)

@@ -3,7 +3,7 @@
 import pytest
 import torch
 from looks import in_look
-from runs import make_trainer
+from runs import train_run
 
 from lang3dxl_ns.components.appearance import Look
 from lang3dxl_ns.components.losses import rgb_loss
@@ -22,9 +22,7 @@ def pipeline(request, scene, tmp_path_factory):
         tmp_path_factory.mktemp("half"),
         {"pipeline__model__appearance__opacity_shift": request.param},
     )
-    trainer = make_trainer(scene, None, None, folder, 24, semantics=False, **{USE: "on"}, **shift)
-    trainer.setup()
-    trainer.train()
+    trainer = train_run(scene, None, None, folder, 24, semantics=False, **{USE: "on"}, **shift)
     field = trainer.pipeline.model.appearance
     with torch.no_grad():
         field.vectors.mul_(10)

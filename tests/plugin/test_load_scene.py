@@ -11,7 +11,7 @@ import pytest
 import torch
 from PIL import Image
 from plyfile import PlyData
-from runs import make_trainer
+from runs import train_run
 from scenes import view_of, write_scene
 from tiny_models import make_tiny_clip
 
@@ -37,9 +37,7 @@ def trainer(tmp_path_factory, tiny_clip, tiny_dense):
     data = write_scene(root / "scene", photos=6, points=200, mixed=True)
     (data / "masks").mkdir()
     Image.new("L", (8, 6), 255).save(data / "masks" / "photo_001.png")
-    trainer = make_trainer(data, tiny_clip, tiny_dense, root / "outputs", 30, **WHOLE_SKY)
-    trainer.setup()
-    trainer.train()
+    trainer = train_run(data, tiny_clip, tiny_dense, root / "outputs", 30, **WHOLE_SKY)
     data.rename(root / "moved")
     return trainer
 

@@ -13,7 +13,7 @@ from idle_worker import idle
 from nerfstudio.configs.base_config import ViewerConfig
 from nerfstudio.utils.eval_utils import eval_setup
 from nerfstudio.viewer.viewer import Viewer
-from runs import make_trainer
+from runs import make_trainer, train_run
 from scenes import view_of, write_scene
 
 from lang3dxl_ns.plugin.panel import INVITATION, stand_of
@@ -30,11 +30,9 @@ def trainer(tmp_path_factory, tiny_clip, tiny_dense):
     """A run whose photos are gone."""
     root = tmp_path_factory.mktemp("run")
     data = write_scene(root / "scene", photos=6, points=200, mixed=True)
-    trainer = make_trainer(
+    trainer = train_run(
         data, tiny_clip, tiny_dense, root / "outputs", 30, pipeline__model__appearance__use="on"
     )
-    trainer.setup()
-    trainer.train()
     (data / "images").rename(data / "renamed")
     return trainer
 

@@ -4,7 +4,7 @@ from copy import deepcopy
 
 import pytest
 import torch
-from runs import make_trainer
+from runs import train_run
 
 import lab.baselines  # noqa: F401, which registers fmgs
 from lang3dxl_ns.common.errors import UserError
@@ -119,10 +119,7 @@ def trained(scene, tiny_clip, tiny_dense, tmp_path_factory):
     """A short run, with regions of one color in place of SAM's."""
     changes = {"pipeline__datamanager__regions": "felzenszwalb", "pipeline__model__downsampler__hidden": 16}
     folder = tmp_path_factory.mktemp("paper")
-    trainer = make_trainer(scene, tiny_clip, tiny_dense, folder, 4, method="lang3dxl-paper", **changes)
-    trainer.setup()
-    trainer.train()
-    return trainer
+    return train_run(scene, tiny_clip, tiny_dense, folder, 4, method="lang3dxl-paper", **changes)
 
 
 def test_mixed_precision_trains_in_bfloat16_on_a_cpu_that_multiplies_it(
@@ -131,9 +128,7 @@ def test_mixed_precision_trains_in_bfloat16_on_a_cpu_that_multiplies_it(
     def losses(multiplies: bool, **changes) -> torch.Tensor:
         monkeypatch.setattr(trainer_module, "multiplies_bfloat16", lambda: multiplies)
         changes |= {"pipeline__datamanager__regions": "none", "pipeline__model__downsampler__hidden": 16}
-        trainer = make_trainer(scene, tiny_clip, tiny_dense, tmp_path, 2, method="lang3dxl-paper", **changes)
-        trainer.setup()
-        trainer.train()
+        trainer = train_run(scene, tiny_clip, tiny_dense, tmp_path, 2, method="lang3dxl-paper", **changes)
         assert not trainer.grad_scaler.is_enabled()
         return torch.stack([trainer.pipeline.last_losses[name] for name in ("rgb", "clip", "dense")]).detach()
 

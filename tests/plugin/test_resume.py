@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from runs import make_trainer
+from runs import train_run
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.open_scene import load_scene
@@ -54,10 +54,7 @@ def whole(scene, tiny_clip, tiny_dense, tmp_path_factory):
     """An uninterrupted run of 20 steps with a checkpoint every five."""
     folder = tmp_path_factory.mktemp("whole")
     changes = EVERYTHING | {"steps_per_save": 5, "save_only_latest_checkpoint": False}
-    trainer = make_trainer(scene, tiny_clip, tiny_dense, folder, 20, **changes)
-    trainer.setup()
-    trainer.train()
-    return trainer
+    return train_run(scene, tiny_clip, tiny_dense, folder, 20, **changes)
 
 
 @pytest.mark.parametrize("step", [5, 10])
@@ -139,9 +136,7 @@ def whole_from_photos(starts, scene, tiny_clip, tiny_dense, tmp_path_factory):
     """An uninterrupted run of 20 steps whose codes start from photos, with a checkpoint every five."""
     changes = FROM_PHOTOS | {"steps_per_save": 5, "save_only_latest_checkpoint": False}
     folder = tmp_path_factory.mktemp("from_photos")
-    trainer = make_trainer(scene, tiny_clip, tiny_dense, folder, 20, **changes)
-    trainer.setup()
-    trainer.train()
+    trainer = train_run(scene, tiny_clip, tiny_dense, folder, 20, **changes)
     assert starts == [trainer.pipeline.model.run]
     return trainer
 
@@ -170,9 +165,7 @@ def test_codes_that_were_trained_do_not_start_again_in_a_longer_run(train, scene
 @pytest.fixture(scope="module")
 def finished(scene, tiny_clip, tiny_dense, tmp_path_factory):
     """A finished run of three steps whose checkpoint holds codes."""
-    trainer = make_trainer(scene, tiny_clip, tiny_dense, tmp_path_factory.mktemp("finished"), 3)
-    trainer.setup()
-    trainer.train()
+    trainer = train_run(scene, tiny_clip, tiny_dense, tmp_path_factory.mktemp("finished"), 3)
     assert "_model.gauss_params.codes" in last_checkpoint(trainer)["pipeline"]
     return trainer
 

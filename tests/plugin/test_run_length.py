@@ -20,11 +20,6 @@ def test_a_schedule_has_the_same_shape_at_every_length(steps):
     assert schedule.multiple(2 * steps) == pytest.approx(0.01)
 
 
-def test_log_linear_decay_halves_the_exponent_halfway():
-    schedule = RunScheduleConfig(shape="log-linear", end=0.01, total_steps=100)
-    assert schedule.multiple(50) == pytest.approx(0.1)
-
-
 def test_schedules_leave_plain_floats_in_the_checkpoint():
     optimizer = torch.optim.Adam([torch.nn.Parameter(torch.zeros(1))], lr=1.0)
     scheduler = RunScheduleConfig(end=0.1, total_steps=10).setup().get_scheduler(optimizer, 1.0)

@@ -46,14 +46,3 @@ def test_beyond_its_range_a_schedule_keeps_the_nearer_end():
     ):
         assert schedule(-1) == schedule(0)
         assert schedule(2) == schedule(1)
-
-
-@pytest.mark.parametrize("x", [0.0, 0.3, 0.9, 1.0])
-def test_numpy_scalars_never_leak_out(x):
-    one, x = np.float64(1.0), np.float64(x)
-    values = [
-        log_linear(x, one, one),
-        semantic_ramp(x, one),
-        cosine_decay(x, one, one, one),
-    ]
-    assert {type(value) for value in values} == {float}

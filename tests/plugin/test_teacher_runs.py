@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from fake_gpu import fake_gpu
-from runs import make_trainer
+from runs import train_run
 from scenes import write_scene
 from tiny_models import make_tiny_clip
 from tiny_teachers import TEACHERS
@@ -37,10 +37,7 @@ def trained(name, small, folder, **changes):
         "steps_per_eval_image": 0,
         **changes,
     }
-    trainer = make_trainer(small, clip, "none", folder / "outputs", iterations=2, **changes)
-    trainer.setup()
-    trainer.train()
-    return trainer
+    return train_run(small, clip, "none", folder / "outputs", iterations=2, **changes)
 
 
 @pytest.mark.slow

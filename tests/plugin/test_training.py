@@ -9,7 +9,7 @@ import torch
 from nerfstudio.cameras.cameras import CameraType
 from nerfstudio.utils.eval_utils import eval_setup
 from PIL import Image
-from runs import make_trainer
+from runs import train_run
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.plugin.trainer import Lang3DXLTrainer
@@ -26,10 +26,7 @@ def finished(scene, tiny_clip, tiny_dense, tmp_path_factory):
     """A finished run of six steps, to look at."""
     folder = tmp_path_factory.mktemp("finished")
     changes = {"pipeline__model__decoder__name": "paper"}
-    trainer = make_trainer(scene, tiny_clip, tiny_dense, folder, iterations=6, **changes)
-    trainer.setup()
-    trainer.train()
-    return trainer
+    return train_run(scene, tiny_clip, tiny_dense, folder, iterations=6, **changes)
 
 
 def parameters(trainer) -> dict[str, torch.Tensor]:

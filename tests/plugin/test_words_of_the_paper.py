@@ -1,7 +1,7 @@
 """The paper's method finds words."""
 
 import pytest
-from runs import make_trainer
+from runs import train_run
 
 from lab.landmark.demo_scene import DemoScene
 from lab.landmark.novel_views_of_runs import evaluate_novel_views
@@ -28,11 +28,9 @@ def test_words_are_found_half_as_well_as_by_the_teacher_and_none_collapses(tmp_p
     shape = {"photos": 14, "test_views": 6, "width": 288, "height": 216, "workers": 1}
     scene = write_scene(DemoScene(out=tmp_path / "scene", seed=620, family="cathedral", wild=False, **shape))
     changes = {f"pipeline__{path}": value for path, value in SMALL.items()}
-    trainer = make_trainer(
+    trainer = train_run(
         scene, "builtin", "builtin", tmp_path / "run", 150, method="lang3dxl-paper", **changes
     )
-    trainer.setup()
-    trainer.train()
     found = average(
         [
             photo.metrics

@@ -83,20 +83,6 @@ def test_a_folder_gives_masks_of_any_size_and_the_log_names_photos_without(photo
     assert lines == ["1 of 3 photos have no mask and are used whole: north/b.png"]
 
 
-def test_masks_count_from_half_brightness(photos, tmp_path):
-    for bright, expected in ((127, False), (128, True)):
-        make_mask(tmp_path / "kept" / "c.png", bright=bright)
-        masked = run(photos, PreparationConfig(foreground=str(tmp_path / "kept")), tmp_path)
-        assert bool(masked[2].read_mask().any()) is expected
-
-
-@pytest.mark.parametrize("file", ["a.png", "a.jpg", "a.JPG", "a.jpeg", "a.jpg.png"])
-def test_a_mask_is_named_like_its_photo(tmp_path, file):
-    make_mask(tmp_path / "north" / file)
-    assert MaskFolder(tmp_path).find("north/a.jpg") == tmp_path / "north" / file
-    assert MaskFolder(tmp_path).find("south/a.jpg") is None
-
-
 def test_auto_keeps_what_the_data_has_and_none_drops_it(photos, tmp_path):
     make_mask(tmp_path / "masks" / "c.png")
     found = [replace(photo, mask_path=MaskFolder(tmp_path / "masks").find(photo.name)) for photo in photos]

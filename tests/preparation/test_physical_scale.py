@@ -33,10 +33,6 @@ def make_photo(
     return TrackedPhoto(name, lens, pose, points, np.array(pixels))
 
 
-def with_lens(photo: TrackedPhoto, **changes) -> TrackedPhoto:
-    return replace(photo, lens=replace(photo.lens, **changes))
-
-
 def make_reconstruction(*photos, points=()) -> Reconstruction:
     points = np.array(points, dtype=float).reshape(-1, 3)
     return Reconstruction(
@@ -100,13 +96,6 @@ def test_angle_rules_differ_as_published(ratio, paper, half):
     assert pixel_size(photo) / exact == pytest.approx(half, abs=6e-3)
 
 
-def test_pixel_size_is_the_mean_of_the_width_and_height_versions():
-    photo = make_photo(width=1500, height=500)
-    wide = pixel_size(with_lens(photo, height=1500))
-    high = pixel_size(with_lens(photo, width=500))
-    assert pixel_size(photo) == pytest.approx((wide + high) / 2)
-
-
 @pytest.mark.parametrize("angle", ["half", "paper", "exact"])
 def test_a_resized_photo_shows_the_same_physical_crops(angle):
     photo = make_photo(width=1600, height=1200)
@@ -141,39 +130,12 @@ def test_a_rescaled_world_scales_sizes_linearly(scene):
     assert scaled_proposed.largest == pytest.approx(7 * proposed.largest)
 
 
-def test_the_median_distance_ignores_an_outlier_and_the_mean_does_not():
-    points = [(0, 0, 9), (0, 0, 10), (0, 0, 10), (0, 0, 11)]
-    outlier = make_photo([*points, (0, 0, 1e9)])
-    assert pixel_size(outlier) == pytest.approx(pixel_size(make_photo(points)))
-    assert pixel_size(outlier, distance="mean") > 1e6 * pixel_size(outlier)
-
-
-def test_the_inner_mean_leaves_points_at_the_edges_out():
-    photo = make_photo([(0, 0, 10), (0, 0, 99), (0, 0, 99)], pixels=[(500, 500), (500, 950), (50, 500)])
-    assert pixel_size(photo, distance="mean-inner", angle="exact") == pytest.approx(0.01)
-    only_edges = replace(photo, pixels=np.zeros((3, 2)))
-    assert pixel_size(only_edges, distance="mean-inner") == pixel_size(photo, distance="mean")
-
-
 def test_points_whose_pixels_are_not_recorded_count_where_the_camera_sees_them():
     """Scenes without a COLMAP model have points alone."""
     points, pixels = [(0, 0, 10), (0, 13.5, 30), (9, 0, 20)], [(500, 500), (500, 950), (950, 500)]
     recorded, bare = make_photo(points, pixels), make_photo(points, np.zeros((0, 2)))
     assert pixel_size(bare, "mean-inner") == pixel_size(recorded, "mean-inner")
     assert pixel_size(bare, "mean-inner") != pixel_size(bare, "mean")
-
-
-@pytest.mark.parametrize("points", [[], [(0, 0, 0)]])
-@pytest.mark.parametrize("distance", ["median", "mean", "mean-inner"])
-def test_a_photo_without_usable_points_has_no_pixel_size(points, distance):
-    assert pixel_size(make_photo(points), distance) is None
-
-
-@pytest.mark.parametrize("focal", [1e-6, 1e9])
-@pytest.mark.parametrize("angle", ["half", "paper", "exact"])
-def test_extreme_focal_lengths_give_finite_sizes(focal, angle):
-    size = pixel_size(make_photo(focal=focal), angle=angle)
-    assert 0 < size < np.inf
 
 
 def test_photos_without_tracks_fall_back_to_the_view_and_then_to_the_scene():
@@ -222,16 +184,6 @@ def test_a_mixed_scene_reads_back(mixed_scene):
         assert np.abs(projected - photo.pixels).max() < 1e-6
         assert photo.camera_from_world @ [*photo.center, 1] == pytest.approx(np.zeros(3), abs=1e-12)
         assert photo.lens.distortion == ()
-
-
-def test_text_and_binary_models_are_the_same(scene, tmp_path):
-    import pycolmap
-
-    pycolmap.Reconstruction(scene / "sparse" / "0").write_text(tmp_path)
-    binary, text = read_reconstruction(scene / "sparse" / "0"), read_reconstruction(tmp_path)
-    assert np.abs(np.sort(binary.points, axis=0) - np.sort(text.points, axis=0)).max() < 1e-9
-    for name, photo in binary.photos.items():
-        assert pixel_size(photo) == pytest.approx(pixel_size(text.photos[name]))
 
 
 def test_keypoints_without_a_finite_3d_point_are_left_out(scene, tmp_path):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import os
 import re
 import signal
@@ -120,16 +119,6 @@ def test_a_process_killed_while_writing_leaves_no_entry_and_its_leftover_is_remo
     assert leftover.exists()  # recent: another process may be writing it
     os.utime(leftover, (time.time() - 7200,) * 2)
     store.remove_leftovers()
-    assert files(store) == []
-
-
-def test_a_full_disk_is_a_users_error_and_leaves_nothing_half_written(store, monkeypatch):
-    def full(_):
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    monkeypatch.setattr(os, "fsync", full)
-    with pytest.raises(UserError, match=r"no space left in .*a\.jpg"):
-        store.write("clip", "a.jpg", entry(), SETTINGS)
     assert files(store) == []
 
 

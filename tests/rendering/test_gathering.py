@@ -46,32 +46,6 @@ def composite(camera: Camera, carried: torch.Tensor) -> torch.Tensor:
     return rasterize(scene, camera, carried).image
 
 
-def test_a_lifted_feature_is_the_mean_of_the_pixels_weighted_by_the_contribution():
-    """Weights by hand: what a Gaussian alone carries a 1 of is its contribution to every pixel."""
-    generator = torch.Generator().manual_seed(1)
-    pixels = [torch.rand(SIZE, SIZE, 4, generator=generator, dtype=torch.float64) for _ in cameras()]
-    for view in pixels:
-        view[..., -1] = 1
-        view[:, :3] = 0  # masked
-    views = [
-        (lambda carried, camera=camera: composite(camera, carried), whole(view))
-        for camera, view in zip(cameras(), pixels, strict=True)
-    ]
-    lifted, mass = gather(5, views, 3, torch.zeros(1, dtype=torch.float64))
-
-    expected, masses = torch.zeros(5, 3, dtype=torch.float64), torch.zeros(5, dtype=torch.float64)
-    for index in range(4):
-        total = torch.zeros(3, dtype=torch.float64)
-        for camera, view in zip(cameras(), pixels, strict=True):
-            weight = composite(camera, torch.eye(5, dtype=torch.float64)[:, index : index + 1])
-            total += (weight * view[..., :-1]).sum((0, 1))
-            masses[index] += (weight * view[..., -1:]).sum()
-        expected[index] = total / masses[index]
-    torch.testing.assert_close(lifted, expected)
-    torch.testing.assert_close(mass, masses)
-    assert (lifted[-1] == 0).all()  # never seen
-
-
 def test_the_memory_to_work_in_changes_nothing(monkeypatch):
     """Channels are gathered a few at a time where memory is short, and the result moves to the CPU."""
     generator = torch.Generator().manual_seed(2)

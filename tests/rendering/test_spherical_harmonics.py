@@ -20,21 +20,6 @@ def test_colors_equal_those_of_gsplat(degree):
     )
 
 
-def test_the_basis_is_orthonormal_on_the_sphere():
-    generator = torch.Generator().manual_seed(1)
-    directions = torch.randn(200_000, 3, generator=generator, dtype=torch.float64)
-    one_each = torch.eye(16, dtype=torch.float64)[None, :, :3]
-    basis = torch.cat(
-        [
-            spherical_harmonics(3, directions, one_each.roll(3 * i, 1).expand(len(directions), -1, -1))
-            for i in range(6)
-        ],
-        dim=1,
-    )[:, :16]
-    gram = 4 * torch.pi * basis.T @ basis / len(directions)
-    torch.testing.assert_close(gram, torch.eye(16, dtype=torch.float64), atol=0.02, rtol=0)
-
-
 def test_the_length_of_a_direction_does_not_matter():
     directions, coefficients = sample()
     torch.testing.assert_close(

@@ -1,12 +1,15 @@
 """Fixtures of the page's tests: in each process one browser, and one page for tests of the painted wall."""
 
 import shutil
+from dataclasses import replace
 
 import pytest
-from pages import DESK, HOSTILE, STAND, SWITCHES, WORDS, opened, rest, served
-from painted_scene import painted_scene
+import torch
+from pages import DESK, HOSTILE, RESET, SWITCHES, WORDS, opened, rest, served
+from painted_scene import CHANNELS, encode_texts, painted_file, painted_scene
 
-from lang3dxl_ns.files.scene_file import Provenance
+from lab.baselines.lifting import LiftedFeatures
+from lang3dxl_ns.files.scene_file import Provenance, write_scene
 from lang3dxl_ns.web.write_page import Page, write_page
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
@@ -47,15 +50,19 @@ def desk(browser, address):
 @pytest.fixture
 def page(desk):
     """The page, without prompts, where the overview's photo was taken."""
-    for _ in range(4):  # whatever is open
-        desk.locator("#frame").press("Escape")
-    desk.evaluate("lang3dxl.clear()")
-    desk.evaluate("Object.assign(lang3dxl.view.mover, { free: false, shift: false })")
-    desk.evaluate("document.getElementById('free').checked = false")
-    desk.emulate_media(reduced_motion="reduce")  # no second of flight
-    desk.get_by_role("button", name="Overview").click()
-    desk.evaluate(STAND)
+    desk.evaluate(RESET)
     rest(desk)
-    desk.emulate_media(reduced_motion="no-preference")
     yield desk
     assert desk.complaints == []
+
+
+@pytest.fixture
+def file(tmp_path, monkeypatch):
+    """A scene file, whose CLIP is the painted one."""
+    monkeypatch.setattr("lang3dxl_ns.query.scene.text_encoder", lambda file, device: encode_texts)
+    decoder, painted = LiftedFeatures(CHANNELS, 0), painted_scene()
+    decoder.name = "lifting"
+    codes = torch.cat([torch.nan_to_num(painted.codes), torch.ones(len(painted.codes), 1)], 1)
+    told = replace(painted_file(), data="wall")
+    write_scene(tmp_path / "wall.scene", painted_scene(decoder=decoder, codes=codes, file=told))
+    return tmp_path / "wall.scene"

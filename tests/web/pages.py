@@ -21,6 +21,10 @@ from PIL import Image
 
 from lang3dxl_ns.components.compression import CompressedField
 from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
+from lang3dxl_ns.files.scene_file import read_scene
+from lang3dxl_ns.web.serve import PageServer
+from lang3dxl_ns.web.teach import PageWords
+from lang3dxl_ns.web.write_page import Page
 
 SWITCHES = [
     *("--headless", "--no-sandbox", "--disable-background-networking", "--disable-component-update"),
@@ -113,6 +117,17 @@ def served(folder):
     server.server_close()
 
 
+@contextmanager
+def live(file, photos=None):
+    scene = read_scene(file, "cpu")
+    page = Page(scene, photos=photos, live=True, own_words=PageWords(file))
+    server = PageServer(page, port=0)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    yield server
+    server.shutdown()
+    server.server_close()
+
+
 def opened(browser, address, viewport):
     """A page that is ready, with what it complained about or fetched from elsewhere."""
     page = browser.contexts[0].new_page()  # a profile, which keeps compiled scripts and shaders
@@ -135,6 +150,23 @@ STAND = "(({ mover, about }) => mover.jump(mover.standing(about.start)))(lang3dx
 PRESS = """((key, held = {}) => document.getElementById("frame").dispatchEvent(
   new KeyboardEvent("keydown", { key, bubbles: true, cancelable: true, ...held })))"""
 """A key pressed on the picture; false if the page took it."""
+
+
+TAPS = f"""((key, count, held) => {{
+  for (let k = 0; k < count; k++) {PRESS}(key, held), dispatchEvent(new KeyboardEvent("keyup", {{ key }}));
+}})"""
+"""A key struck so many times, in one frame."""
+
+
+RESET = f"""(() => {{
+  for (let k = 0; k < 4; k++) ({PRESS})("Escape"); // whatever is open
+  lang3dxl.clear();
+  Object.assign(lang3dxl.view.mover, {{ free: false, shift: false }});
+  document.getElementById("free").checked = false;
+  document.getElementById("overview").click();
+  {STAND};
+}})()"""
+"""Leaves what is open, forgets the prompts, and stands where the overview's photo was taken, in one frame."""
 
 
 def prompts_of(page) -> list[str]:
@@ -163,7 +195,7 @@ def until_told(page, where: str, part: str) -> None:
 def rest(page) -> None:
     """Wait until nothing is left to draw. The page's policy forbids playwright's own way to wait."""
     for _ in range(1000):
-        page.wait_for_timeout(300)
+        page.wait_for_timeout(100)
         if page.evaluate("lang3dxl.view.resting"):
             return
     raise AssertionError("the page never rests")

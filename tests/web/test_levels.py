@@ -7,7 +7,7 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from pages import DESK, STAND, opened, picture, served
-from painted_scene import painted_looks, painted_scene, painted_splats
+from painted_scene import painted_codes, painted_looks, painted_scene, painted_splats
 
 from lang3dxl_ns.rendering import Splats, render
 from lang3dxl_ns.rendering.projection import rotations
@@ -15,7 +15,7 @@ from lang3dxl_ns.web.levels import levels_of, merged, tree_order
 from lang3dxl_ns.web.write_page import Page, write_page
 
 MOST = 500
-"""Most Gaussians of a chunk here; the painted wall has 5,185."""
+"""Most Gaussians of a chunk here; the rough wall has ten times as many."""
 HELD = """async () => {
   while (lang3dxl.view.parts.size < 21) await new Promise((go) => setTimeout(go, 50));
 }"""
@@ -28,11 +28,13 @@ def some_splats(count: int, seed: int = 0) -> Splats:
     return Splats(means, quats, scales, opacities, torch.randn(count, 4, 3, generator=g))
 
 
-def rough_wall(**changes):
-    """The painted wall, with no two Gaussians at one depth."""
-    splats = painted_splats()
+def rough_wall():
+    """The painted wall in more detail, with no two Gaussians at one depth."""
+    splats = painted_splats(12)
     depths = 0.02 * torch.rand(len(splats), 1, generator=torch.Generator().manual_seed(0))
-    return painted_scene(splats=replace(splats, means=splats.means + F.pad(depths, (2, 0))), **changes)
+    return painted_scene(
+        splats=replace(splats, means=splats.means + F.pad(depths, (2, 0))), codes=painted_codes(12)
+    )
 
 
 def even_splats(means):

@@ -2,24 +2,19 @@
 
 import http.client
 import json
-import threading
-from contextlib import contextmanager
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
-from pages import DESK, opened, rest, served, until, until_linked, until_told
-from painted_scene import CHANNELS, encode_texts, painted_file, painted_scene
+from pages import DESK, live, opened, rest, served, until, until_linked, until_told
+from painted_scene import painted_scene
 from PIL import Image
 
-from lab.baselines.lifting import LiftedFeatures
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.files.scene_file import describe_scene_file, keep_words, read_scene, write_scene
+from lang3dxl_ns.files.scene_file import describe_scene_file, keep_words, read_scene
 from lang3dxl_ns.query.floaters import FLOATS
 from lang3dxl_ns.web.photos import PHOTO_SIDE, small_photo
-from lang3dxl_ns.web.serve import PageServer
-from lang3dxl_ns.web.teach import PageWords
 from lang3dxl_ns.web.write_page import Page, write_page
 from lang3dxl_ns.words.taught_words import Example, load_words
 
@@ -36,29 +31,6 @@ def photos(tmp_path_factory):
         (folder / photo.name).parent.mkdir(parents=True, exist_ok=True)
         Image.fromarray(pixels).resize(photo.file_size).save(folder / photo.name, quality=95)
     return folder
-
-
-@contextmanager
-def live(file, photos=None):
-    scene = read_scene(file, "cpu")
-    page = Page(scene, photos=photos, live=True, own_words=PageWords(file))
-    server = PageServer(page, port=0)
-    threading.Thread(target=server.serve_forever, daemon=True).start()
-    yield server
-    server.shutdown()
-    server.server_close()
-
-
-@pytest.fixture
-def file(tmp_path, monkeypatch):
-    """A scene file, whose CLIP is the painted one."""
-    monkeypatch.setattr("lang3dxl_ns.query.scene.text_encoder", lambda file, device: encode_texts)
-    decoder, painted = LiftedFeatures(CHANNELS, 0), painted_scene()
-    decoder.name = "lifting"
-    codes = torch.cat([torch.nan_to_num(painted.codes), torch.ones(len(painted.codes), 1)], 1)
-    told = replace(painted_file(), data="wall")
-    write_scene(tmp_path / "wall.scene", painted_scene(decoder=decoder, codes=codes, file=told))
-    return tmp_path / "wall.scene"
 
 
 def posted(server, content, **headers):

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from pages import DESK, PHONE, PRESS, SIDE, opened, picture, rest, served, until, until_told
+from pages import DESK, PHONE, PRESS, SIDE, TAPS, opened, picture, rest, served, until, until_told
 from painted_scene import painted_file, painted_scene
 
 from lang3dxl_ns.web.write_page import Page, write_page
@@ -21,8 +21,7 @@ def test_cameras_are_drawn_and_doubtful_ones_apart_with_their_reason(browser, tm
     with served(tmp_path) as address:
         page = opened(browser, address, DESK)
         page.evaluate("lang3dxl.view.mover.free = true")
-        for _ in range(12):
-            page.locator("#frame").press("s")  # until the cameras stand before the eye
+        page.evaluate(f"{TAPS}('s', 12)")  # until the cameras stand before the eye
         page.get_by_role("button", name="Cameras").click()
         drawn = (
             "(kind) => document.querySelector(`#pyramids .${kind}`).getAttribute('d').split('M').length - 1"
@@ -40,7 +39,7 @@ def test_a_slow_machine_draws_drafts_until_nothing_changes(page):
     picture(page)
     width = page.evaluate("document.querySelector('#frame canvas').width")
     draft = page.evaluate("""async () => {
-      lang3dxl.view.cost = 8e3;  // a draft for two seconds
+      lang3dxl.view.cost = 1e3;  // no sharp picture for two seconds
       lang3dxl.view.wake();
       await new Promise(requestAnimationFrame);
       await new Promise(requestAnimationFrame);
@@ -88,18 +87,13 @@ def test_one_walks_looks_and_orbits_by_keys(page):
 
 @pytest.mark.slow
 def test_the_eye_stays_before_the_wall_unless_shift_is_held(page):
-    for _ in range(100):
-        page.wait_for_timeout(100)
-        if page.evaluate("Boolean(lang3dxl.view.mover.space)"):
-            break
+    until(page, "Boolean(lang3dxl.view.mover.space)")
     depth = "lang3dxl.view.mover.camera.position.z"  # the wall is z = 0
-    for _ in range(40):
-        page.locator("#frame").press("w")
+    page.evaluate(f"{TAPS}('w', 40)")
     near = page.evaluate(depth)
     assert -2.5 < near < 0
     until_told(page, "#status", "hold Shift")
-    for _ in range(40):
-        page.locator("#frame").press("Shift+W")
+    page.evaluate(f"{TAPS}('W', 40, {{ shiftKey: true }})")
     assert page.evaluate(depth) > 0.5
     page.get_by_role("button", name="Overview").click()
     page.locator("button[aria-pressed=false]", has_text="Walk").wait_for()

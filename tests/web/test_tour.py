@@ -5,9 +5,8 @@ import subprocess
 
 import numpy as np
 import pytest
-from pages import DESK, served, until
+from pages import DESK, live, served, until
 from painted_scene import painted_scene
-from test_live_page import live
 from test_visits import visit
 
 from lang3dxl_ns.common.errors import UserError

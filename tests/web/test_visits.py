@@ -4,6 +4,7 @@ import shutil
 import subprocess
 import tarfile
 from contextlib import contextmanager
+from functools import cache
 
 import pytest
 from pages import PHONE, prompts_of, served, until
@@ -46,27 +47,34 @@ def axe(tmp_path_factory):
     if done.returncode:
         pytest.skip(f"npm gives no {AXE}: {done.stderr.strip()[-200:]}")
     with tarfile.open(next(folder.glob("*.tgz"))) as packed:
-        content = packed.extractfile("package/axe.min.js")
-        (folder / "axe.js").write_bytes(content.read())
-    return folder / "axe.js"
+        return packed.extractfile("package/axe.min.js").read().decode()
+
+
+@cache
+def tab(browser, touch: bool):
+    """A tab that tests visit one after the other, with a touch screen or without."""
+    context = browser.new_context(has_touch=True, is_mobile=True) if touch else browser.contexts[0]
+    page = context.new_page()
+    page.set_default_timeout(120_000)
+    page.complaints = []
+    page.on("pageerror", lambda error: page.complaints.append(str(error)))
+    return page
 
 
 @contextmanager
-def visit(browser, address, size, script=None, **media):
-    """A page that is ready, with what it complained about."""
-    context = browser.new_context(viewport=size, has_touch=size is PHONE, is_mobile=size is PHONE)
-    page = context.new_page()
-    page.set_default_timeout(120_000)
-    page.emulate_media(reduced_motion="reduce", **media)
-    if script is not None:
-        page.add_init_script(path=script)
-    complaints = []
-    page.on("pageerror", lambda error: complaints.append(str(error)))
+def visit(browser, address, size, forced_colors="none"):
+    """A page that is ready and has not moved yet, and complains about nothing."""
+    page = tab(browser, size is PHONE)
+    page.set_viewport_size(size)
+    page.emulate_media(reduced_motion="reduce", forced_colors=forced_colors)
+    page.complaints.clear()
     page.goto(address)
     page.evaluate("lang3dxl.ready.then(() => true)")
-    yield page
-    context.close()
-    assert complaints == []
+    try:
+        yield page
+    finally:
+        page.goto("about:blank")
+    assert page.complaints == []
 
 
 def tab_to(page, name: str) -> None:
@@ -218,7 +226,8 @@ def test_forced_colors_keep_the_colors_that_tell_prompts_apart(browser, address,
 def test_axe_finds_nothing(browser, address, axe, size):
     run = """axe.run().then(({ violations }) =>
       violations.map(({ id, nodes }) => [id, nodes.map(({ html }) => html)]))"""
-    with visit(browser, address, size, axe) as page:
+    with visit(browser, address, size) as page:
+        page.evaluate(axe)
         assert page.evaluate(run) == []
         page.evaluate("lang3dxl.ask('dome; windows; zzz')")
         page.evaluate("document.getElementById('more').open = true")

@@ -180,7 +180,11 @@ def test_an_overview_reaches_a_spire_and_not_the_sky(scene):
     def overview(places, sizes, mass):
         means = (torch.tensor(places) - view[:3, 3]) @ view[:3, :3]
         scales = torch.tensor(sizes)[:, None].expand(-1, 3)
-        splats = replace(scene.splats.select(torch.arange(len(means))), means=means.float(), scales=scales)
+        splats = replace(
+            scene.splats.select(torch.arange(len(means)) % len(scene.splats)),
+            means=means.float(),
+            scales=scales,
+        )
         return extent(SimpleNamespace(overview=scene.overview, splats=splats, mass=torch.tensor(mass)))
 
     spread = torch.rand(2000, 2, generator=draw) * torch.tensor([right - left, bottom - top])
