@@ -270,8 +270,10 @@ def test_configs(settings_of_a_run, tmp_path, data):
 
 MASK = {"size": [4, 5], "counts": [3, 4, 13]}
 EXAMPLE = {"photo": "a.jpg", "points": [[1, 2]], "not_points": [], "size": [50, 40], "mask": MASK}
+OUTLINED = EXAMPLE | {"outlines": [[[1, 1], [20, 1], [20, 30]]]}
+del OUTLINED["mask"]
 VALUES = {"bias": 0.1, "text": 0.2, "doubt": 0.05, "vector": [0.5, 0.5], "precision": {"a.jpg": 0.5}}
-WORD = VALUES | {"name": "door", "clip": "abc", "scene": "castle", "examples": [EXAMPLE]}
+WORD = VALUES | {"name": "door", "clip": "abc", "scene": "castle", "examples": [EXAMPLE, OUTLINED]}
 OBJECT = {"category": "door", "segmentation": [[1, 1], [20, 1], [20, 30]], "bbox": [1, 1, 20, 30]}
 FIGURES = {"protocol": {"layout": "plain"}, "photos": {"a.jpg": {"ap_door": 0.4}}, "map": 0.4}
 

@@ -31,11 +31,6 @@ export class List extends EventTarget {
     return found;
   }
 
-  /** Find the things of all prompts that are answered. */
-  findAll() {
-    for (const prompt of this.prompts) if (prompt.relevancy && !prompt.dragged) this.find(prompt).catch(() => {});
-  }
-
   /** Build the part of a prompt's card that lists its things; null before they are found. */
   part(prompt) {
     if (!prompt.found) return null;

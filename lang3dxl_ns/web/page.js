@@ -48,10 +48,12 @@ async function answer(prompt) {
   return Object.assign(prompt, found, { matching: wholeCount(found.matching), views: null, finding: null });
 }
 
-/** Find the views that show prompts best, once their heat is drawn. */
+/** Find the views that show prompts best, and their things, once their heat is drawn. */
 function findPlaces() {
-  for (const prompt of prompts.filter((one) => one.relevancy && !one.finding && !one.dragged)) {
-    const { relevancy, threshold, turn } = prompt;
+  for (const prompt of prompts.filter((one) => one.relevancy && !one.dragged)) {
+    const { relevancy, threshold, turn, finding } = prompt;
+    attempt(() => list.find(prompt));
+    if (finding) continue;
     prompt.finding = think("find", { relevancy, threshold }).then((views) => {
       if (turn !== prompt.turn) return;
       prompt.views = views;
@@ -75,7 +77,8 @@ async function ask(typed, turn = cleared) {
   await reading;
   quiet();
   if (about.words && MIDDLE.test(typed)) {
-    await describe(middle());
+    const { x, y } = middle();
+    describe(await whatIs(x, y), [x, y]);
     say("This is in the middle of the view. Click on anything else to learn what it is.");
     return { known: true };
   }
@@ -114,15 +117,15 @@ function add(prompt) {
 /** Offer the word that a misspelled one most likely means; a click puts it in its place. */
 function offerMeant(meant, prompt) {
   const mend = () => (prompts.includes(prompt) && remove(prompt), ask(asTyped({ text: meant, negatives: prompt.negatives })));
-  $("near").replaceChildren("Did you mean ", small(meant, () => attempt(mend)), "?");
+  $("near").append(element("span", {}, "Did you mean ", small(meant, () => attempt(mend)), "?"));
 }
 
 /** Offer the words closest to an unknown one; a click puts a word in its place. */
 function offerClosest({ unknown, closest }, { text, negatives }) {
   const mended = (word) => ({ text: text === unknown ? word : text, negatives: negatives.map((one) => (one === unknown ? word : one)) });
   const buttons = closest.map((word) => askFor(word, asTyped(mended(word))));
-  $("near").replaceChildren(`This page doesn't know “${shown(unknown)}”: it answers ${about.known.length.toLocaleString("en")} words by itself. `,
-    buttons.length ? "Closest: " : "", ...buttons); // prettier-ignore
+  $("near").append(element("span", {}, `This page doesn't know “${shown(unknown)}”: it answers ${about.known.length.toLocaleString("en")} words by itself. `,
+    buttons.length ? "Closest: " : "", ...buttons)); // prettier-ignore
 }
 
 /** Create a button that asks for a word. */
@@ -236,20 +239,19 @@ async function tell({ x, y, without }) {
   if ($("measuring").checked) return measure(x, y);
   const teaching = prompts.find((prompt) => prompt.examples && prompt.open);
   if (teaching) return addMark(teaching, [[x, y]], without || teaching.without);
-  await describe({ x, y });
+  const found = await whatIs(x, y);
+  if (!list.pick(found.rows)) describe(found, [x, y]);
 }
 
-/** Tell which words fit a place, or choose the thing there. */
-async function describe({ x, y }) {
-  const { words, rows, point } = await whatIs(x, y);
-  if (list.pick(rows)) return;
+/** Tell which words fit a pixel. */
+function describe({ words, rows, point }, pixel) {
   const best = words[0]?.[1] ?? 0;
   const tied = words.filter(([, score]) => score > best - TIE), several = tied.length > 2;
   const buttons = (several ? tied : words).map(([word, score]) => askFor(word, quoted(word), several ? word : `${word} ${percent(score)}`));
   quiet();
   const told = several ? "Here several words fit equally well, so none is sure:" : "Here, words that fit best:";
   $("here").replaceChildren(element("p", {}, words.length ? told : `Nothing is there${rows.length ? " that has a name" : ""}.`),
-    element("div", {}, ...buttons, ...(rows.length ? [small("Like this", () => attempt(() => likeThis([[x, y]])))] : [])),
+    element("div", {}, ...buttons, ...(rows.length ? [small("Like this", () => attempt(() => likeThis([pixel])))] : [])),
     ...(point ? [element("p", {}, `It is ${heightAsText(point, about)}${inShares(about)}.`)] : [])); // prettier-ignore
   $("here").hidden = false;
 }
@@ -489,7 +491,6 @@ function listen() {
   view.addEventListener("click", ({ detail }) => attempt(() => tell(detail)));
   view.addEventListener("double", ({ detail }) => attempt(() => focusOn(detail)));
   view.addEventListener("drawn", findPlaces);
-  view.addEventListener("drawn", () => list.findAll());
   list.addEventListener("change", () => draw());
   view.addEventListener("moved", () => {
     drawBoxes();

@@ -41,9 +41,8 @@ def photo_json(photo: ScenePhoto, address: str | None) -> dict[str, Any]:
     width, height = photo.file_size
     lens = photo.lens.resized(width, height)
     numbers = [lens.fx, lens.fy, lens.cx, lens.cy, *lens.distortion] if lens.distorts else None
-    file = {"file": [width, height], "distortion": numbers, "fisheye": lens.fisheye}
-    told = {"name": photo.name, "photo": address, "doubtful": photo.doubtful}
-    return {**told, **file, **camera_json(photo.full_camera)}
+    told = {"name": photo.name, "photo": address, "doubtful": photo.doubtful, "file": [width, height]}
+    return {**told, "distortion": numbers, "fisheye": lens.fisheye, **camera_json(photo.full_camera)}
 
 
 def small_photo(photo: ScenePhoto, folder: Path) -> bytes:

@@ -2,7 +2,7 @@
 import { element } from "./cards.js";
 import { inFile } from "./photos.js";
 
-const MASK_SIDE = 1024, GRID = 15, SAMPLES = 48, LONGEST = 6000; // pixels of a mask's longer side, a side of the grid around an outline, pixels sampled in it, characters of a link
+const GRID = 15, SAMPLES = 48, LONGEST = 6000; // a side of the grid around an outline, pixels sampled in it, characters of a link
 export const UNNAMED = /^like this (\d+)$/;
 
 /** Sample pixels evenly within an outline. */
@@ -59,27 +59,7 @@ export function asPython(examples, cameras) {
     if (example.outline && !example.without) found.outlines.push(file(example.outline));
     else found[example.without ? "not_points" : "points"].push(...pixels(example.outline ? inside(example.outline) : example.points));
   }
-  return [...photos.values()].map(({ outlines, ...rest }) => ({ ...rest, ...(outlines.length && { mask: maskOf(outlines, rest.size) }) }));
-}
-
-/** Draw outlines (pixels of a file of this size) as a mask, in run lengths column by column, outside first. */
-function maskOf(outlines, [width, height]) {
-  const zoom = Math.min(MASK_SIDE / Math.max(width, height), 1);
-  const canvas = element("canvas", { width: Math.max(Math.round(width * zoom), 1), height: Math.max(Math.round(height * zoom), 1) }), pen = canvas.getContext("2d");
-  for (const outline of outlines) {
-    pen.beginPath();
-    for (const [x, y] of outline) pen.lineTo(x * zoom, y * zoom);
-    pen.fill();
-  }
-  const { data } = pen.getImageData(0, 0, canvas.width, canvas.height), counts = [];
-  let run = 0, within = false;
-  for (let x = 0; x < canvas.width; x++)
-    for (let y = 0; y < canvas.height; y++, run++) {
-      if (data[4 * (y * canvas.width + x) + 3] >= 128 === within) continue;
-      counts.push(run);
-      [run, within] = [0, !within];
-    }
-  return { size: [canvas.height, canvas.width], counts: [...counts, run] };
+  return [...photos.values()].map(({ outlines, ...rest }) => ({ ...rest, ...(outlines.length && { outlines }) }));
 }
 
 /** Write words as a file for `lang3dxl words SCENE --load FILE`, which learns them from their marks. */

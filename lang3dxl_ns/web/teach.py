@@ -43,10 +43,8 @@ class PageWords:
             with locked(self.file.resolve().parent):  # another command that teaches comes first, or waits
                 known = {known_word(word.name): word for word in describe_scene_file(self.file)["taught"]}
                 scene, told = self._taught(scene.with_words(known.values()), name, before, examples)
-                changed = {word: scene.words.get(word) for word in {known_word(name), known_word(before)}}
-                keep_words(
-                    self.file, {word: new for word, new in changed.items() if new is not known.get(word)}
-                )
+                new, keys = scene.words, {known_word(name), known_word(before)}
+                keep_words(self.file, {k: new.get(k) for k in keys if new.get(k) is not known.get(k)})
         return scene, told
 
     def keep_tour(self, content: Mapping[str, Any]) -> str:
@@ -68,7 +66,7 @@ class PageWords:
             return scene, f"The scene forgot {name!r}."
         scene = scene.teach(name, [*others, *examples])
         word = scene.words[key]
-        self._marked[key] = [_plain(example) for example in word.examples[len(others) :]]
+        self._marked[key] = [example.to_json() for example in word.examples[len(others) :]]
         place = "It lasts until the server ends." if self.file is None else f"{self.file.name} keeps it."
         return scene, f"Taught by {len(word.examples)} photo{'s' * (len(word.examples) > 1)}. {place}"
 
@@ -77,12 +75,6 @@ class PageWords:
         word, ours = scene.words.get(name), self._marked.pop(name, [])
         if word is None or not ours:
             return scene
-        left = [example for example in word.examples if _plain(example) not in ours]
-        rest = [other for other in scene.words.values() if other is not word]
-        scene = scene.with_words(rest)
+        left = [example for example in word.examples if example.to_json() not in ours]
+        scene = scene.with_words(other for other in scene.words.values() if other is not word)
         return scene.teach(word.name, left) if left else scene
-
-
-def _plain(example: Example) -> dict[str, Any]:
-    """Return an example as it comes back from a file."""
-    return Example.from_json(example.to_json()).to_json()

@@ -99,10 +99,8 @@ def _pictures(scene: Scene, shots: Iterable[Shot]) -> Iterator[bytes]:
     for camera, prompts, caption, count in shots:
         if prompts != asked:
             asked, question = prompts, scene.ask(list(prompts)) if prompts else None
-        if question is None:
-            pixels = scene.render(camera).pixels
-        else:
-            pixels = together(scene.matches(question, camera))[: camera.height]  # without the legend
+        heat = None if question is None else together(scene.matches(question, camera))
+        pixels = scene.render(camera).pixels if heat is None else heat[: camera.height]  # without the legend
         picture = Image.fromarray(np.ascontiguousarray(pixels))
         if caption:
             place, font = (camera.width / 2, 0.93 * camera.height), ImageFont.load_default(camera.height / 24)

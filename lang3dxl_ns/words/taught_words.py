@@ -14,6 +14,7 @@ import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from numpy import ndarray as Array
+from PIL import Image, ImageDraw
 from torch import Tensor
 
 from lang3dxl_ns.common.checks import expect
@@ -96,19 +97,15 @@ class Example:
     @classmethod
     def from_json(cls, content: Mapping[str, Any]) -> Example:
         """Build the example; raises ValueError, LookupError, TypeError or UserError for anything else."""
-        mask = box = None
+        mask, size = None, content.get("size")
+        size = None if size is None else (int(size[0]), int(size[1]))
         if "mask" in content:
             height, width = map(int, content["mask"]["size"])
             expect(min(height, width) > 0 and max(height, width) <= MASK_SIDE, "a mask is too large")
             mask = mask_of(content["mask"]["counts"], (height, width))
-        if "box" in content:
-            left, top, right, bottom = map(float, content["box"])
-            box = (left, top, right, bottom)
-        points, others = (
-            tuple((float(x), float(y)) for x, y in content[name]) for name in ("points", "not_points")
-        )
-        size = content.get("size")
-        size = None if size is None else (int(size[0]), int(size[1]))
+        elif size is not None and "outlines" in content:  # of a page
+            mask = mask_within(content["outlines"], size)
+        box, points, others = content.get("box"), content["points"], content["not_points"]
         return cls(str(content["photo"]), mask, box, points, others, size)
 
 
@@ -133,6 +130,18 @@ def mask_of(lengths: Sequence[int], size: tuple[int, int]) -> Bool[Array, "h w"]
     expect(len(counts) <= whole + 1 and min(counts, default=0) >= 0, "a mask has more runs than pixels")
     expect(sum(counts) == whole, "run lengths don't fit the size of their mask")
     return np.repeat(np.arange(len(counts)) % 2 == 1, counts).reshape(size, order="F")
+
+
+def mask_within(outlines: Sequence[Any], size: tuple[int, int]) -> Bool[Array, "h w"]:
+    """Draw what outlines (pixels of a file of this width and height) hold. Raises ValueError for others."""
+    zoom = MASK_SIDE / max(size)
+    picture = Image.new("1", (max(round(size[0] * zoom), 1), max(round(size[1] * zoom), 1)))
+    for outline in outlines:
+        places = zoom * np.array(outline, float)
+        near = places.shape[1:] == (2,) and abs(places).max() <= 2 * MASK_SIDE  # not if one is NaN
+        expect(near, "an outline leaves its photo")
+        ImageDraw.Draw(picture).polygon(places.ravel().tolist(), fill=1)
+    return np.asarray(picture)
 
 
 def _kept(mask: Bool[Array, "h w"]) -> Bool[Array, "h w"]:
@@ -211,8 +220,10 @@ def known_word(text: str) -> str:
 
 def words_from_json(content: Sequence[Any]) -> list[TaughtWord]:
     """Build all words of a file; raises as `TaughtWord.from_json`, also for masks that are too many."""
-    masks = [example["mask"]["size"] for word in content for example in word["examples"] if "mask" in example]
-    expect(sum(math.prod(map(int, size)) for size in masks) <= _MOST_PIXELS, "its masks are too large")
+    examples = [example for word in content for example in word["examples"]]
+    pixels = sum("outlines" in example for example in examples) * MASK_SIDE**2
+    pixels += sum(math.prod(map(int, one["mask"]["size"])) for one in examples if "mask" in one)
+    expect(pixels <= _MOST_PIXELS, "its masks are too large")
     return list(map(TaughtWord.from_json, content))
 
 

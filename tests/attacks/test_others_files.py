@@ -25,7 +25,7 @@ from lang3dxl_ns.scene.capture import open_capture
 from lang3dxl_ns.scene.companions import cache_folder
 from lang3dxl_ns.scene.record import same_clip
 from lang3dxl_ns.web.write_page import Page, write_page
-from lang3dxl_ns.words.taught_words import TaughtWord, load_words, mask_of, save_words
+from lang3dxl_ns.words.taught_words import Example, TaughtWord, load_words, mask_of, save_words
 
 SETTINGS = {"rule": 1}
 
@@ -196,10 +196,17 @@ def test_masks_are_bounded_before_they_are_made(tmp_path, word, size, counts):
     with pytest.raises(UserError, match="is not a file of taught words"):
         load_words(tmp_path / "a.json")
     many = {**example, "mask": {"size": [1024, 1024], "counts": [0, 1 << 20]}}
-    described = word.to_json() | {"examples": [many] * 1_025}
-    (tmp_path / "b.json").write_text(json.dumps({"version": 1, "words": [described]}))
-    with pytest.raises(UserError, match="its masks are too large"):
-        load_words(tmp_path / "b.json")
+    drawn = {**example, "size": [40, 30], "outlines": [[[1, 1], [20, 1], [20, 20]]]}
+    del drawn["mask"]
+    for one in (many, drawn):
+        described = word.to_json() | {"examples": [one] * 1_025}
+        (tmp_path / "b.json").write_text(json.dumps({"version": 1, "words": [described]}))
+        with pytest.raises(UserError, match="its masks are too large"):
+            load_words(tmp_path / "b.json")
+    assert Example.from_json(drawn).mask.mean() == pytest.approx(19 * 19 / 2 / 40 / 30, rel=0.02)
+    for outline in ([[1, 1], [1e30, 1], [9, 9]], [[1, 1], [float("nan"), 1], [9, 9]], [[1, 1, 1]], [], 3):
+        with pytest.raises((ValueError, TypeError)):
+            Example.from_json(drawn | {"outlines": [outline]})
     assert np.array_equal(mask_of([1, 2, 1], (2, 2)), [[False, True], [True, False]])
 
 

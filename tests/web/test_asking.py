@@ -203,6 +203,12 @@ def test_an_unknown_negative_is_replaced_by_the_one_chosen(page):
     page.evaluate("""lang3dxl.ask('"dome" not "belfrey"')""")
     page.locator("#near").get_by_role("button", name="belfry", exact=True).click()
     page.get_by_text("dome not belfry").wait_for()
+    page.evaluate("lang3dxl.ask('belfrey; dome; zzz')")  # each that isn't known is told
+    assert [told.split("”")[0] for told in page.locator("#near span").all_inner_texts()] == [
+        f"This page doesn't know “{word}" for word in ("belfrey", "zzz")
+    ]
+    page.locator("#near").get_by_role("button", name="belfry", exact=True).click()
+    page.get_by_text("belfry", exact=True).wait_for()
     until(page, "document.getElementById('near').textContent", "")
 
 
