@@ -100,13 +100,15 @@ export function unsure(request, found, view, shown = (word) => word) {
       return null;
     }
   };
+  const plain = told({}), length = plain === null ? 0 : answerTo(request, of({}), view).length;
+  const mayLack = Math.floor(MISSED * length) > length; // a list may lack what a count may
   const wide = wordsOf(request).filter((word) => {
     const { things, candidates } = found[word];
-    return new Set([things, sureOf(things), [...things, ...candidates]].map((some) => told({ [word]: some }))).size > 1;
+    return (mayLack && word === request.word) || new Set([things, sureOf(things), [...things, ...candidates]].map((some) => told({ [word]: some }))).size > 1;
   });
   if (wide.length) return wide.map((word) => `${shown(word)}: ${count(found[word])}`).join(", ");
   const [kind, sign] = grammar.superlatives[request.superlative] ?? ["left", 1];
-  if (kind === "left" || kind === "top" || told({}) === null) return null;
+  if (kind === "left" || kind === "top" || plain === null) return null;
   const sizes = answerTo({ ...request, superlative: null }, of({}), view).map((thing) => measure(thing, kind, view)).sort((a, b) => sign * (a - b));
   const close = sizes.length > 1 && Math.max(sizes[0], sizes[1]) < CLOSE * Math.min(sizes[0], sizes[1]);
   return close ? `another ${shown(request.word)} measures nearly the same` : null;
