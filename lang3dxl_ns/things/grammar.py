@@ -17,7 +17,7 @@ from numpy import ndarray as Array
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import read_json
 from lang3dxl_ns.query.scene import Scene
-from lang3dxl_ns.things.find import Things, up_of
+from lang3dxl_ns.things.find import MISSED, Things, up_of
 from lang3dxl_ns.things.thing import Thing
 
 BESIDE = 1.5
@@ -177,17 +177,25 @@ def answer(request: Request, found: Sequence[Things], sight: Facing) -> list[Thi
 def unsure(request: Request, found: Sequence[Things], sight: Facing) -> str | None:
     """Tell what may make an answer wrong; None if nothing does. Arguments are those of `answer`.
 
-    The answer has to be the same without the things that few photos show, and with all candidates. Sizes are
-    known roughly: where the next thing is nearly as large, either may be the largest.
+    The answer has to be the same without the things that few photos show, and with all candidates. A list may
+    lack what a count may (`MISSED`). Sizes are known roughly: where the next thing is nearly as large, either
+    may be the largest.
     """
-    wide = []
+    wide = {request.word} if _may_lack(request, found, sight) else set[str]()
     for one in (one for one in found if one.word in request.words):
         ways = (one.things, one.sure, [*one.things, *one.candidates])
         each = [[replace(other, things=some) if other is one else other for other in found] for some in ways]
         if len({_told(request, listed, sight) for listed in each}) > 1:
-            wide.append(f"{one.word}: {one.count}")
+            wide.add(one.word)
+    told = [f"{one.word}: {one.count}" for one in found if one.word in wide]
     close = (_close(part, found, sight) for part in request.parts)
-    return ", ".join(wide) or next(filter(None, close), None)
+    return ", ".join(told) or next(filter(None, close), None)
+
+
+def _may_lack(request: Request, found: Sequence[Things], sight: Facing) -> bool:
+    """Return whether an answer is a list so long that its things may not be all."""
+    told = _told(replace(request, count=False), found, sight)
+    return isinstance(told, frozenset) and int(MISSED * len(told)) > len(told)
 
 
 def _told(request: Request, found: Sequence[Things], sight: Facing) -> int | frozenset[int] | None:

@@ -106,12 +106,14 @@ export function unsure(request, found, view, shown = (word) => word) {
       return null;
     }
   };
+  const plain = told({}), length = plain === null ? 0 : answerTo(request, of({}), view).length;
+  const mayLack = Math.floor(MISSED * length) > length; // a list may lack what a count may
   const wide = wordsOf(request).filter((word) => {
     const { things, candidates } = found[word];
-    return new Set([things, sureOf(things), [...things, ...candidates]].map((some) => told({ [word]: some }))).size > 1;
+    return (mayLack && word === request.word) || new Set([things, sureOf(things), [...things, ...candidates]].map((some) => told({ [word]: some }))).size > 1;
   });
   if (wide.length) return wide.map((word) => `${shown(word)}: ${count(found[word])}`).join(", ");
-  for (const part of told({}) === null ? [] : partsOf(request)) {
+  for (const part of plain === null ? [] : partsOf(request)) {
     const [kind, sign] = grammar.superlatives[part.superlative] ?? ["left", 1];
     if (kind === "left" || kind === "top") continue;
     const sizes = answerTo({ ...part, superlative: null }, of({}), view).map((thing) => measure(thing, kind, view)).sort((a, b) => sign * (a - b));
