@@ -4,6 +4,7 @@ import re
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from pages import DESK, opened, served, until_linked, until_told
 from painted_scene import painted_file, painted_scene
 
@@ -20,22 +21,6 @@ CLICK = """async ([x, y]) => {
 }"""
 
 
-def test_two_clicks_tell_a_distance_in_meters_and_its_height(browser, tmp_path):
-    meters = Georeference(20.0, (0.0, 1.0, 0.0), (1.0, 0.0, 0.0), 0.03, 5)
-    for name, known in (("gps", meters), ("none", None)):
-        write_page(Page(painted_scene(file=replace(painted_file(), georeference=known))), tmp_path / name)
-        with served(tmp_path / name) as address:
-            tab = opened(browser, address, DESK)
-            tab.evaluate("document.getElementById('measuring').click()")
-            assert tab.evaluate(CLICK, [-0.6, -0.4]) == "Click the other end."
-            told = tab.evaluate(CLICK, [0.6, 0.5])
-            tab.close()
-        apart, rise = map(float, re.match(r"([\d.]+) \S+ apart, one ([\d.]+) ", told).groups())
-        scale = 20 if known else 100 / np.ptp(heights_of(painted_scene()))
-        assert abs(apart - 1.5 * scale) < 0.15 * scale and abs(rise - 0.9 * scale) < 0.15 * scale
-        assert ("± 3 %" in told) == (known is not None) == ("landmark's height" not in told)
-
-
 HERE = """async ([x, y]) => {
   const [column, row] = lang3dxl.view.pixel([x, y, 0]), here = document.getElementById("here");
   here.hidden = true;
@@ -45,22 +30,40 @@ HERE = """async ([x, y]) => {
 }"""
 
 
-def test_a_click_tells_its_height_above_the_ground(browser, tmp_path):
-    meters = Georeference(20.0, (0.0, 1.0, 0.0), (1.0, 0.0, 0.0), 0.03, 5)
-    for name, known in (("gps", meters), ("none", None)):
-        scene = painted_scene(file=replace(painted_file(), georeference=known))
-        write_page(Page(scene), tmp_path / name)
-        (ground, top), up = heights_of(scene), up_of(scene)
-        unit = 20 if known else 100 / (top - ground)
-        with served(tmp_path / name) as address:
-            tab = opened(browser, address, DESK)
-            for height in (0.5, 1.5):
-                told = tab.evaluate(HERE, [0.6, height])
-                number = float(re.search(r"It is ([\d.]+) (m|%) above the ground", told)[1])
-                assert abs(number - unit * (up @ [0.6, height, 0] - ground)) < 0.1 * unit
-            low = (ground + 0.01 - 0.6 * up[0]) / up[1]
-            assert "It is on the ground" in tab.evaluate(HERE, [0.6, low])
-            tab.close()
+@pytest.fixture(scope="module", params=[20.0, None], ids=["meters", "no meters"])
+def wall(request, browser, tmp_path_factory):
+    """The painted wall, how many meters a unit of it has, if it is known, and its page."""
+    known = request.param and Georeference(request.param, (0.0, 1.0, 0.0), (1.0, 0.0, 0.0), 0.03, 5)
+    scene = painted_scene(file=replace(painted_file(), georeference=known))
+    folder = tmp_path_factory.mktemp("wall")
+    write_page(Page(scene), folder)
+    with served(folder) as address:
+        tab = opened(browser, address, DESK)
+        yield scene, request.param, tab
+        tab.close()
+
+
+def test_a_click_tells_its_height_above_the_ground(wall):
+    scene, meters, tab = wall
+    (ground, top), up = heights_of(scene), up_of(scene)
+    unit = meters or 100 / (top - ground)
+    for height in (0.5, 1.5):
+        told = tab.evaluate(HERE, [0.6, height])
+        number = float(re.search(r"It is ([\d.]+) (m|%) above the ground", told)[1])
+        assert abs(number - unit * (up @ [0.6, height, 0] - ground)) < 0.1 * unit
+    low = (ground + 0.01 - 0.6 * up[0]) / up[1]
+    assert "It is on the ground" in tab.evaluate(HERE, [0.6, low])
+
+
+def test_two_clicks_tell_a_distance_in_meters_and_its_height(wall):
+    scene, meters, tab = wall
+    tab.evaluate("document.getElementById('measuring').click()")
+    assert tab.evaluate(CLICK, [-0.6, -0.4]) == "Click the other end."
+    told = tab.evaluate(CLICK, [0.6, 0.5])
+    apart, rise = map(float, re.match(r"([\d.]+) \S+ apart, one ([\d.]+) ", told).groups())
+    scale = meters or 100 / np.ptp(heights_of(scene))
+    assert abs(apart - 1.5 * scale) < 0.15 * scale and abs(rise - 0.9 * scale) < 0.15 * scale
+    assert ("± 3 %" in told) == (meters is not None) == ("landmark's height" not in told)
 
 
 SCALE = """() => {
