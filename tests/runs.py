@@ -54,3 +54,11 @@ def train_run(*given, **changes):
     trainer.setup()
     trainer.train()
     return trainer
+
+
+def all_finite(state) -> bool:
+    """Whether all numbers of a checkpoint's part are finite."""
+    if isinstance(state, torch.Tensor):
+        return bool(state.isfinite().all())
+    values = state.values() if isinstance(state, dict) else state if isinstance(state, list | tuple) else ()
+    return all(map(all_finite, values))

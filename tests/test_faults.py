@@ -1,7 +1,6 @@
 """Bad input and failing hardware: a logged skip or an error that names the file, and no data loss."""
 
 import pickle
-import re
 import zipfile
 from copy import deepcopy
 from pathlib import Path
@@ -61,34 +60,6 @@ def test_photos_that_the_model_does_not_know_are_named(folder, capsys):
     assert len(parse(folder)) == 4
     assert "1 photos of" in (printed := capsys.readouterr().out)
     assert "stranger[1].JPG" in printed
-
-
-@pytest.mark.parametrize("place", ["sparse", "sparse/0", "colmap/sparse/0", "dense/sparse"])
-@pytest.mark.parametrize("form", ["binary", "text"])
-def test_models_are_found_where_people_keep_them(folder, place, form):
-    import pycolmap
-
-    model = pycolmap.Reconstruction(folder / "sparse" / "0")
-    for path in (folder / "sparse" / "0").iterdir():
-        path.unlink()
-    (folder / place).mkdir(parents=True, exist_ok=True)
-    (model.write_binary if form == "binary" else model.write_text)(folder / place)
-    assert len(parse(folder)) == 4
-
-
-@pytest.mark.parametrize("form", ["binary", "text"])
-def test_of_several_models_the_log_says_which_is_used_and_how_large_the_others_are(folder, capsys, form):
-    import pycolmap
-
-    model = pycolmap.Reconstruction(folder / "sparse" / "0")
-    (folder / "sparse" / "1").mkdir()
-    (model.write_binary if form == "binary" else model.write_text)(folder / "sparse" / "1")
-    parse(folder)
-    # Wrapped, with the place in the code at the right, wherever that falls.
-    printed = re.sub(r"\S+\.py:\d+ ", "", " ".join(capsys.readouterr().out.split()))
-    assert "has 2 models" in printed
-    assert "4 photos" in printed
-    assert "sparse/1 with 4" in printed
 
 
 def test_names_with_dots_spaces_unicode_folders_and_one_stem_stay_apart(folder, tmp_path):

@@ -114,25 +114,6 @@ def test_photos_of_something_else_fit_nowhere(collection, tmp_path):
     assert not find_frame(other, collection, tmp_path / "a.ply").fits
 
 
-def test_a_transforms_json_is_read_like_the_colmap_model(collection, tmp_path):
-    written = []
-    for photo in collection.photos:
-        tracked = collection.reconstruction.photos[photo.name]
-        pose = np.linalg.inv(np.vstack([tracked.camera_from_world, [0, 0, 0, 1]]))
-        pose[:3, 1:3] *= -1
-        (tmp_path / photo.name).write_bytes(photo.path.read_bytes())
-        lens = photo.lens
-        written.append({"file_path": f"./{photo.name}", "transform_matrix": pose.tolist()})
-    shared = {"fl_x": lens.fx, "fl_y": lens.fy, "cx": lens.cx, "cy": lens.cy, "w": 120, "h": 90}
-    (tmp_path / "transforms.json").write_text(json.dumps({**shared, "frames": written}))
-    found = open_capture(tmp_path)
-    assert [photo.name for photo in found.photos] == [photo.name for photo in collection.photos]
-    assert [photo.lens for photo in found.photos] == [photo.lens for photo in collection.photos]
-    for name, tracked in found.reconstruction.photos.items():
-        wanted = collection.reconstruction.photos[name].camera_from_world
-        np.testing.assert_allclose(tracked.camera_from_world, wanted, atol=1e-9)
-
-
 def test_few_photos_must_agree_better_than_many():
     def fit(score: float, photos: int) -> Fit:
         return Fit("a frame", np.eye(4), score, photos)

@@ -192,17 +192,6 @@ def test_the_command_reports_and_reports_are_put_together(scene, tmp_path, mask,
         cli.main(["evaluate", "pool", "--reports", str(tmp_path / "other.json"), "--out", str(both)])
 
 
-def test_scenes_of_different_layouts_are_not_put_together(scene, tmp_path):
-    truth, maps = scene
-    write_labels(tmp_path / "teatime", "0001", [box_object("rose window", 16, 8, 47, 23)])
-    for name, folder in (("one", truth), ("two", tmp_path / "teatime")):
-        out = str(tmp_path / name)
-        cli.main(["evaluate", "maps", "--maps", str(maps), "--ground-truth", str(folder), "--out", out])
-    reports = [str(tmp_path / name / "scores.json") for name in ("one", "two")]
-    with pytest.raises(SystemExit, match="differ in layout"):
-        cli.main(["evaluate", "pool", "--reports", *reports, "--out", str(tmp_path / "both")])
-
-
 def test_the_list_of_photos_to_hold_out_is_a_list_of_photos_to_score(scene, tmp_path, mask):
     truth, maps = scene
     names = tmp_path / "held_out.txt"

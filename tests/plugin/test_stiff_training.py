@@ -4,18 +4,12 @@ import shutil
 
 import pytest
 import torch
+from runs import all_finite
 from scenes import write_scene
 
 from lang3dxl_ns.training import batches
 
 QUIET = {"steps_per_eval_image": 0}
-
-
-def all_finite(state) -> bool:
-    if isinstance(state, torch.Tensor):
-        return bool(state.isfinite().all())
-    values = state.values() if isinstance(state, dict) else state if isinstance(state, list | tuple) else ()
-    return all(map(all_finite, values))
 
 
 def is_sound(trainer) -> bool:

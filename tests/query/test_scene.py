@@ -226,14 +226,8 @@ def test_mistakes_are_reported(scene):
         scene.query("dome", "left/001.jpg")
     with pytest.raises(UserError, match="empty"):
         scene.query([], "0002")
-    with pytest.raises(UserError, match="one at a time"):
-        scene.relevancy("dome; wall")
-    with pytest.raises(UserError, match=r"\[3, 4\]"):
-        scene.query("dome", torch.eye(3))
     with pytest.raises(UserError, match="views are requested"):
         scene.find("dome", most=0)
-    with pytest.raises(UserError, match="threshold"):
-        scene.query("dome", "0002", threshold=1.5)
     with pytest.raises(UserError, match="no look"):
         scene.render("0002", look="0002")
 

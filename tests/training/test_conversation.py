@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from painted_scene import encode_texts, painted_codes, painted_scene, painted_splats
+from painted_scene import COUNT, encode_texts, painted_codes, painted_scene, painted_splats
 
 from lang3dxl_ns.training import conversation as module
 from lang3dxl_ns.training.conversation import Conversation
@@ -18,7 +18,7 @@ def model():
     found.settings = SimpleNamespace(total_steps=10)
 
     def snapshot(*_, **settings):
-        keep = torch.arange(len(painted_splats())) < 5000 - 500 * found.step
+        keep = torch.arange(COUNT) < COUNT - 200 * found.step
         return painted_scene(splats=painted_splats().select(keep), codes=painted_codes()[keep])
 
     found.scene = snapshot

@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from runs import all_finite
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.training import batches
@@ -51,13 +52,6 @@ def test_only_steps_in_a_row_stop_the_run_and_a_photo_is_named_once():
         guard.allows(step, "a.jpg", FINE, group(math.nan))
     with pytest.raises(UserError, match=r"3 steps in a row .* photo a\.jpg: gradient of means"):
         guard.allows(2, "a.jpg", FINE, group(math.nan))
-
-
-def all_finite(state) -> bool:
-    if isinstance(state, torch.Tensor):
-        return bool(state.isfinite().all())
-    values = state.values() if isinstance(state, dict) else state if isinstance(state, list | tuple) else ()
-    return all(map(all_finite, values))
 
 
 CODES = {"pipeline__model__decoder__name": "paper"}
