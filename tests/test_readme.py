@@ -32,7 +32,7 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def demo_output(folder) -> str:
-    few = ("--photos", 16, "--test-views", 4)
+    few = ("--photos", 12, "--test-views", 3, "--steps", 150)
     return output("lang3dxl", "demo", "--quick", *few, cwd=folder, shell=True, timeout=1800)
 
 
