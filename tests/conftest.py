@@ -3,8 +3,10 @@
 - `scene`, `tiny_clip`, `tiny_dense`: read-only, made once per process that tests.
 - `train`: a short training with settings of your own, a small sky, and 20 small steps of learning codes of
   three numbers (after so few steps three often seem not enough, and four and six take five times as long). It
-  takes half a second and 15 ms per step: take as few as the law needs, and a module's fixture where several
-  tests only look at the same run.
+  takes half a second and 15 ms per step: take as few as the law needs, and a module's fixture
+  (`runs.train_run`) where several tests only look at the same run.
+- `browser`, `page` (tests/web/conftest.py): Chromium, and the painted wall's page, as it opens; a page of
+  another scene costs a second more.
 - `processes.run("ns-eval", …)`: a command in a process that has the libraries loaded (a second, not ten);
   `processes.Process(function, …)`: a function in one. Commands that train learn codes for 15 seconds, unless
   told `--pipeline.model.decoder.compression.steps 40`.
