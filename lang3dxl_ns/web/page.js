@@ -634,4 +634,4 @@ window.lang3dxl = {
   prompts,
 };
 if ("asked" in $("ask").dataset) $("ask").requestSubmit(); // before this module ran: see start.js
-window.lang3dxl.ready.catch((error) => "told" in $("status").dataset || say(error.message)); // start.js may have said why
+window.lang3dxl.ready.catch((error) => say(error.message));

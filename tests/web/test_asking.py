@@ -266,6 +266,8 @@ def test_without_webgl_it_says_what_helps(browser, address):
     page.add_init_script("HTMLCanvasElement.prototype.getContext = () => null")
     page.goto(address)
     page.evaluate("lang3dxl.ready.catch(() => true)")
+    page.get_by_role("combobox", name="Look for").press("Enter")
+    page.wait_for_timeout(300)
     until_told(page, "#status", "hardware acceleration")
     page.close()
 
