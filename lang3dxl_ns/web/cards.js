@@ -17,6 +17,7 @@ export const small = (label, onclick, more = {}) => element("button", { classNam
 
 /** Tell something; usual: what is told while nothing has happened, which a folded panel hides. */
 export function say(message, usual = false) {
+  if ("told" in $("status").dataset) return; // start.js has said why the page can't work
   $("status").textContent = message;
   $("status").classList.toggle("usual", usual);
 }

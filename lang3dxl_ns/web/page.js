@@ -458,12 +458,6 @@ function on(id, kind, act) {
 
 function listen() {
   let moving;
-  on("ask", "submit", (event) => {
-    event.preventDefault();
-    const typed = $("word").value;
-    $("word").value = "";
-    return tidy(typed) ? ask(typed) : null;
-  });
   for (const kind of ["input", "focus"]) on("word", kind, (event) => reading.then(() => offer(event)));
   on("clear", "click", clear);
   on("overview", "click", () => (photos.hide(false), quiet(), view.mover.overview()));
@@ -484,7 +478,7 @@ function listen() {
   on("length", "change", typeLength);
   on("measuring", "change", () => ((ends = []), ($("known").hidden = true), $("measuring").checked ? say("Click one end of what you measure.") : quiet()));
   on("free", "change", () => (view.mover.free = $("free").checked));
-  on("fold", "click", () => ($("fold").ariaExpanded = String(!document.body.classList.toggle("folded"))));
+  on("fold", "click", () => fold());
   on("full", "click", () => (document.fullscreenElement ? document.exitFullscreen() : document.documentElement.requestFullscreen()));
   $("full").hidden = !document.fullscreenEnabled;
   document.addEventListener("fullscreenchange", () => ($("full").ariaPressed = String(Boolean(document.fullscreenElement))));
@@ -514,10 +508,15 @@ function press(event) {
   const again = key.toLowerCase() === "y" || event.shiftKey, onPicture = event.target === $("frame") || event.target === document.body;
   const act = command
     ? { z: () => (again ? steps.redo() : steps.undo()), y: () => steps.redo() }[key.toLowerCase()]
-    : { "/": () => $("word").focus(), ",": () => photos.step(-1), ".": () => photos.step(1), "[": () => list.step(-1), "]": () => list.step(1), ...(onPicture && { Enter: () => tell(middle()), f: () => focusOn(middle()) }) }[key];
+    : { "/": () => (fold(false), $("word").focus()), ",": () => photos.step(-1), ".": () => photos.step(1), "[": () => list.step(-1), "]": () => list.step(1), ...(onPicture && { Enter: () => tell(middle()), f: () => focusOn(middle()) }) }[key];
   if (!act) return;
   event.preventDefault();
   attempt(async () => act());
+}
+
+/** Hide the panel but for messages, or show it. */
+function fold(folded = !document.body.classList.contains("folded")) {
+  $("fold").ariaExpanded = String(!document.body.classList.toggle("folded", folded));
 }
 
 /** Close what is open, the latest first; nothing is lost. */
@@ -567,6 +566,12 @@ function hideFloaters() {
 // ── start ──
 
 async function open() {
+  on("ask", "submit", async () => {
+    const typed = $("word").value;
+    $("word").value = "";
+    await window.lang3dxl.ready; // one may type while the scene loads
+    return tidy(typed) ? ask(typed) : null;
+  });
   about = await (await fetched("scene.json")).json();
   kept = new Kept(about);
   document.title = $("title").textContent = about.title;
@@ -628,4 +633,5 @@ window.lang3dxl = {
   whatIs: async (x, y, most) => (await whatIs(x, y, most)).words,
   prompts,
 };
-window.lang3dxl.ready.catch((error) => "told" in $("status").dataset || say(error.message)); // start.js may have said why
+if ("asked" in $("ask").dataset) $("ask").requestSubmit(); // before this module ran: see start.js
+window.lang3dxl.ready.catch((error) => say(error.message));

@@ -1,6 +1,10 @@
 // Runs first, without modules, and says why where the page cannot work.
 (function () {
   var status = document.getElementById("status"), reason;
+  document.getElementById("ask").addEventListener("submit", function (event) {
+    event.preventDefault();
+    event.target.dataset.asked = "";
+  });
   if (location.protocol === "file:") {
     reason = "A browser loads no scene from a folder: serve it (python -m http.server -d FOLDER), then open http://localhost:8000.";
   } else if (!document.createElement("canvas").getContext("webgl2")) {

@@ -199,6 +199,23 @@ def test_the_same_prompt_asked_twice_at_once_has_one_card(page):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("file", ["page.js", "splats.*.bin"])
+def test_a_word_that_is_typed_while_the_page_loads_is_answered_then(browser, address, file):
+    page, held = browser.contexts[0].new_page(), []
+    page.on("console", lambda message: held.append(message.text))
+    page.route(f"**/{file}", lambda route: held.append(route))
+    page.goto(address, wait_until="commit")
+    until(page, lambda: len(held), 1)
+    page.get_by_role("combobox", name="Look for").fill("dome")
+    page.keyboard.press("Enter")
+    page.wait_for_timeout(200)
+    (waiting,) = held  # and no complaint
+    waiting.continue_()
+    until(page, "window.lang3dxl?.prompts.map(({ text }) => text).join()", "dome")
+    page.close()
+
+
+@pytest.mark.slow
 def test_an_unknown_negative_is_replaced_by_the_one_chosen(page):
     page.evaluate("""lang3dxl.ask('"dome" not "belfrey"')""")
     page.locator("#near").get_by_role("button", name="belfry", exact=True).click()
@@ -249,6 +266,8 @@ def test_without_webgl_it_says_what_helps(browser, address):
     page.add_init_script("HTMLCanvasElement.prototype.getContext = () => null")
     page.goto(address)
     page.evaluate("lang3dxl.ready.catch(() => true)")
+    page.get_by_role("combobox", name="Look for").press("Enter")
+    page.wait_for_timeout(300)
     until_told(page, "#status", "hardware acceleration")
     page.close()
 

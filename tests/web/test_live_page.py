@@ -212,7 +212,7 @@ def test_a_name_that_is_half_typed_stays_when_an_answer_arrives(browser, file, t
 def test_a_page_whose_server_is_gone_says_so_also_with_a_folded_panel(browser, file):
     with live(file) as server:
         page = opened(browser, address_of(server), DESK)
-        page.context.route("**/api/**", lambda route: route.abort())
+        page.route("**/api/**", lambda route: route.abort())
         page.get_by_role("button", name="Panel").click()
         page.evaluate("location.hash = 'ask=campanile'")
         page.get_by_text("server of this page doesn't answer").wait_for()  # Playwright waits until it is seen

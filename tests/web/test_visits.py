@@ -206,6 +206,8 @@ def test_a_folded_panel_hides_nothing_that_is_told(browser, address, size):
             "['status', 'near', 'here'].some((id) => document.getElementById(id).checkVisibility())",
             False,
         )
+        page.locator("#frame").press("/")  # starts typing here too
+        until(page, f"({seen})('word') && document.activeElement.id", "word")
 
 
 @pytest.mark.slow
