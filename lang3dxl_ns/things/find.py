@@ -39,6 +39,9 @@ SURE = 0.6
 MISSED = 1.4
 """Likely number of things for each one found, at most: what few photos show is missed. So ranges of windows
 hold on six of six validation landmarks, and with the candidates alone on four."""
+PRESENT = 0.9
+"""Peak of a word from which what it finds are things; below, they are candidates. Words for what is there
+reach 1.00 on six validation landmarks, five of six look-alikes of what isn't .31 to .81."""
 SAME = 0.5
 """Overlap (intersection over union of weights) from which two words' things are one."""
 
@@ -88,11 +91,11 @@ def things_of(scene: Answering, question: Question) -> list[Things]:
     means, axes = scene.splats.means.double().cpu().numpy(), axes_of(scene)
     sharp = [_sharpened(scene, relevancy) for relevancy in question.relevancy]
     # A word whose peak stays below the lowest level names nothing here.
-    present = (peaks(question.relevancy) > LEVELS[0]).tolist()
+    peak = peaks(question.relevancy).tolist()
     pieces: list[list[Piece]] = [[] for _ in sharp]
     for views in _views(scene, torch.stack(sharp, 1)):
-        for found, shown, there in zip(pieces, views, present, strict=True):
-            found += pieces_of(shown) if there else []
+        for found, shown, best in zip(pieces, views, peak, strict=True):
+            found += pieces_of(shown) if best > LEVELS[0] else []
 
     def box(weight: Float[Array, " n"], one: Joined) -> Box:
         return upright_box(means[one.rows], weight[one.rows], axes)
@@ -104,7 +107,8 @@ def things_of(scene: Answering, question: Question) -> list[Things]:
         boxed = partial(box, weight)
         parts = grown(join(pieces[i], weight, boxed), len(weight))
         joined = placed(parts, [boxed(part) for part in parts])
-        sure = [one for one in without_crumbs(joined) if one.views >= VIEWS]
+        present = peak[i] >= PRESENT or prompt.taught is not None
+        sure = [one for one in without_crumbs(joined) if one.views >= VIEWS and present]
         listed = [_known(_thing(prompt.text, one, boxed(one), mass, values), known, mass)
                   for one in [*sure, *(one for one in joined if one not in sure)]]  # fmt: skip
         things, candidates = listed[: len(sure)], listed[len(sure) :]

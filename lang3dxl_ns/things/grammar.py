@@ -181,21 +181,18 @@ def unsure(request: Request, found: Sequence[Things], sight: Facing) -> str | No
     lack what a count may (`MISSED`). Sizes are known roughly: where the next thing is nearly as large, either
     may be the largest.
     """
-    wide = {request.word} if _may_lack(request, found, sight) else set[str]()
+    listed = _told(replace(request, count=False), found, sight)
+    wide = set[str]()
+    if isinstance(listed, frozenset) and int(MISSED * len(listed)) > len(listed):
+        wide.add(request.word)
     for one in (one for one in found if one.word in request.words):
         ways = (one.things, one.sure, [*one.things, *one.candidates])
         each = [[replace(other, things=some) if other is one else other for other in found] for some in ways]
-        if len({_told(request, listed, sight) for listed in each}) > 1:
+        if len({_told(request, other, sight) for other in each}) > 1:
             wide.add(one.word)
     told = [f"{one.word}: {one.count}" for one in found if one.word in wide]
     close = (_close(part, found, sight) for part in request.parts)
     return ", ".join(told) or next(filter(None, close), None)
-
-
-def _may_lack(request: Request, found: Sequence[Things], sight: Facing) -> bool:
-    """Return whether an answer is a list so long that its things may not be all."""
-    told = _told(replace(request, count=False), found, sight)
-    return isinstance(told, frozenset) and int(MISSED * len(told)) > len(told)
 
 
 def _told(request: Request, found: Sequence[Things], sight: Facing) -> int | frozenset[int] | None:

@@ -24,10 +24,9 @@ VIEWS = 2
 """Number of views that must show a thing: what a single one shows may be a smear."""
 CRUMB = 0.03
 """Weight, relative to the typical thing's (half of all weight is in heavier ones), below which a thing is a
-crumb of another, unless two photos show it clearly."""
-CLEAR = 1e-3
-"""Share of a photo that a thing fills in the second one of those that show most of it, from which it is no
-crumb, however light: a pinnacle beside a spire."""
+crumb of another, unless many views show it."""
+OFTEN = 5
+"""Number of views that show a thing from which it is no crumb, however small: a pinnacle beside a spire."""
 OVER = 0.4
 """Level distance of two things, relative to their summed widths, up to which one stands over the other."""
 OVERLAP = 0.05
@@ -56,14 +55,6 @@ class Joined:
     def views(self) -> int:
         """Number of views that show it."""
         return len({piece.photo for piece in self.votes})
-
-    @property
-    def area(self) -> float:
-        """Share of the photo that it fills in the second one of those that show most of it; 0 with one."""
-        most = dict[str, float]()
-        for piece in self.votes:
-            most[piece.photo] = max(most.get(piece.photo, 0.0), piece.area)
-        return sorted([0.0, 0.0, *most.values()])[-2]
 
 
 def join(pieces: Sequence[Piece], weight: Float[Array, " n"], box: Callable[[Joined], Box]) -> list[Joined]:
@@ -171,9 +162,9 @@ def _grouped(things: Sequence[Joined], group: Int[Array, " n"]) -> list[Joined]:
 
 
 def without_crumbs(things: Sequence[Joined]) -> list[Joined]:
-    """Leave out the things that weigh far less than the typical one and that no two photos show clearly."""
+    """Leave out the things that weigh far less than the typical one and that few views show."""
     weights = np.sort([thing.weight for thing in things])[::-1]
     if not len(weights):
         return []
     typical = weights[np.searchsorted(weights.cumsum(), weights.sum() / 2)]
-    return [thing for thing in things if thing.weight >= CRUMB * typical or thing.area >= CLEAR]
+    return [thing for thing in things if thing.weight >= CRUMB * typical or thing.views >= OFTEN]

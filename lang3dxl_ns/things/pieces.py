@@ -33,8 +33,8 @@ class Piece:
     """Indices of the Gaussians that it shows."""
     resolution: float
     """Pixels per world unit at its distance."""
-    area: float
-    """Share of the picture that it fills."""
+    area: int
+    """Pixels in it."""
     box: tuple[int, int, int, int]
     """Left, top, right and bottom end in pixels of the training photo."""
     cut: bool
@@ -79,7 +79,7 @@ def pieces_of(shown: Shown) -> Iterator[Piece]:
             depth = float(np.median(shown.depth[down, across][region]))
             box = across.start, down.start, across.stop, down.stop
             cut = box[0] <= 1 or box[1] <= 1 or box[2] >= width - 1 or box[3] >= height - 1
-            yield Piece(shown.photo, own, shown.focal / depth, region.sum() / labels.size, box, cut)
+            yield Piece(shown.photo, own, shown.focal / depth, int(region.sum()), box, cut)
 
 
 def split(heat: Float[Array, "h w"]) -> tuple[Int[Array, "h w"], int]:

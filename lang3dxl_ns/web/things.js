@@ -5,29 +5,30 @@ import { fitted } from "./like.js";
 import { BLUR, spreadAt } from "./pick.js";
 import { seenAt } from "./space.js";
 
-const { LEVELS, PART, DEPTH, FILLED, SHARED, SPLINTER, VIEWS, CRUMB, CLEAR, OVER, OVERLAP, OUTLIERS, COLORED, SAME, SLIM, STRAIGHT, ROUND, CROWN } = language.things;
+const { LEVELS, PART, DEPTH, FILLED, SHARED, SPLINTER, VIEWS, CRUMB, OFTEN, OVER, OVERLAP, OUTLIERS, COLORED, PRESENT, SAME, SLIM, STRAIGHT, ROUND, CROWN } = language.things;
 const SIDE = 240, LEAST = 3; // pixels of a view's longer side, and of the smallest piece
 const FAINT = 0.05, TRACE = 0.004, REACH = 2.5; // relevancy and heat that leave no trace, standard deviations that are drawn
 const RIDGE = 0.1, ROUNDS = 12; // strength of the colors' regularization, Newton steps
 const DC = 0.28209479177387814; // of spherical harmonics: colors are compared as coefficients
 
 /** Find the things of a word: { things, candidates }, each largest first. views: as of find.js; scene: { centers, axes,
- * bytes (packed splats), mass, gap, edges (of boxes, a direction each) }, in one frame. */
-export function thingsOf(views, scene, relevancy) {
+ * bytes (packed splats), mass, gap, edges (of boxes, a direction each) }, in one frame; present: whether the word is surely there. */
+export function thingsOf(views, scene, relevancy, present) {
   const heat = sharpened(scene, relevancy), { mass } = scene;
   const weight = Float64Array.from(relevancy, (value, i) => Math.sqrt(mass[i]) * value);
   const box = ({ rows }) => uprightBox(rows, scene.centers, weight, scene.edges);
   const parts = grown(join(views.flatMap((view, v) => piecesOf(drawn(view, scene, heat), v)), weight, box), weight.length);
   const joined = placed(parts, parts.map(box));
-  const sure = new Set(withoutCrumbs(joined).filter((one) => photosOf(one).size >= VIEWS));
+  const sure = new Set(withoutCrumbs(joined).filter((one) => present && photosOf(one).size >= VIEWS));
   const listed = (some) => some.map((one) => described(one, scene, weight, relevancy)).sort((a, b) => b.weight - a.weight);
   return { things: listed([...sure]), candidates: listed(joined.filter((one) => !sure.has(one))) };
 }
 
-/** Return whether a word's peak reaches the lowest level: one that stays below names nothing here. */
-export function isPresent(relevancy, { best }) {
+/** How surely a word names something here: 0 (its peak stays below the lowest level), 1 (perhaps) or 2. */
+export function presence(relevancy, { best }) {
   const sorted = relevancy.slice().sort(), top = Math.max(Math.ceil(best * sorted.length), 1);
-  return sorted.slice(-top).reduce((sum, value) => sum + value, 0) / top > LEVELS[0];
+  const peak = sorted.slice(-top).reduce((sum, value) => sum + value, 0) / top;
+  return (peak > LEVELS[0]) + (peak >= PRESENT);
 }
 
 /** Things that were found before: one keeps its id whatever word finds it. */
@@ -149,7 +150,7 @@ export function piecesOf({ map, depth, width, height, rows, points, focal, scale
       (left = Math.min(left, x)), (top = Math.min(top, y)), (right = Math.max(right, x + 1)), (bottom = Math.max(bottom, y + 1));
     }
     const cut = left <= 1 || top <= 1 || right >= width - 1 || bottom >= height - 1;
-    return [{ view, rows: own[k], resolution: focal / middle, area: pixels.length / map.length, box: [left, top, right, bottom].map((side) => side / scale), cut }];
+    return [{ view, rows: own[k], resolution: focal / middle, area: pixels.length, box: [left, top, right, bottom].map((side) => side / scale), cut }];
   });
 }
 
@@ -282,19 +283,12 @@ function grouped(things, pairs) {
   })); // prettier-ignore
 }
 
-/** Leave out the things that weigh far less than the typical one and that no two photos show clearly. */
+/** Leave out the things that weigh far less than the typical one and that few views show. */
 export function withoutCrumbs(things) {
   const weights = things.map(({ weight }) => weight).sort((a, b) => b - a), all = weights.reduce((sum, value) => sum + value, 0);
   let before = 0;
   const typical = weights.find((value) => (before += value) >= all / 2) ?? 0;
-  return things.filter((thing) => thing.weight >= CRUMB * typical || areaOf(thing) >= CLEAR);
-}
-
-/** Share of the photo that a thing fills in the second one of those that show most of it; 0 with one. */
-function areaOf({ votes }) {
-  const most = new Map();
-  for (const { view, area } of votes) most.set(view, Math.max(most.get(view) ?? 0, area));
-  return [0, 0, ...most.values()].sort((a, b) => a - b).at(-2);
+  return things.filter((thing) => thing.weight >= CRUMB * typical || photosOf(thing).size >= OFTEN);
 }
 
 /** Find the box around weighted Gaussians along axes, of which the last is up: { center, axes, size }. */

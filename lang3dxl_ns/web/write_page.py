@@ -63,9 +63,9 @@ _SUGGESTED = (
 _NUMBERS = (
     ("ranking", view_ranking, "PEAK LARGE RIM STRONG"),
     ("things", pieces, "LEVELS PART DEPTH FILLED"),
-    ("things", join, "SHARED SPLINTER VIEWS CRUMB CLEAR OVER OVERLAP SLIM STRAIGHT ROUND CROWN"),
+    ("things", join, "SHARED SPLINTER VIEWS CRUMB OFTEN OVER OVERLAP SLIM STRAIGHT ROUND CROWN"),
     ("things", thing, "OUTLIERS"),
-    ("things", find, "COLORED SAME SURE MISSED"),
+    ("things", find, "COLORED PRESENT SAME SURE MISSED"),
     ("things", grammar, "BESIDE INSIDE CLOSE"),
 )
 """Numbers that rank views, tell things apart and relate them, by the modules that hold them."""

@@ -10,10 +10,10 @@ from painted_scene import painted_scene
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.query.trust import FAR
-from lang3dxl_ns.things.find import Things
+from lang3dxl_ns.things.find import PRESENT, Things
 from lang3dxl_ns.things.grammar import Sight, answer, parse, unsure
 from lang3dxl_ns.things.join import Joined, grown, join, placed, without_crumbs
-from lang3dxl_ns.things.pieces import LEAST, Piece, split
+from lang3dxl_ns.things.pieces import LEAST, LEVELS, Piece, split
 from lang3dxl_ns.things.thing import Thing, upright_box
 from lang3dxl_ns.web.write_page import Page, write_page
 
@@ -146,8 +146,7 @@ def test_pieces_join_as_in_python(page):
             wide = rng.choice([8, 16, 18, 38])
             rows = np.unique(rng.integers(start, min(start + wide, 200), 30))
             cut = bool(rng.random() < 0.1)
-            area = float(rng.uniform(0, 2e-3))
-            pieces.append(Piece(str(view), rows, float(rng.random()), area, (0, 0, 1, 1), cut))
+            pieces.append(Piece(str(view), rows, float(rng.random()), len(rows), (0, 0, 1, 1), cut))
     weight, points = rng.random(400), rng.random((400, 3))
     # Two that photos have in one piece, and another in two, are one where one stands over the other.
     for start in range(200, 400, 10):
@@ -157,14 +156,14 @@ def test_pieces_join_as_in_python(page):
         shown += [("4", [*spire, *pinnacle]), ("5", [*spire, *other]), ("5", pinnacle)]
         for photo, rows in shown:
             fine = 9.0 if photo < "3" else 0.5
-            pieces.append(Piece(photo, np.array(rows), fine, 1e-3, (0, 0, 1, 1), False))
+            pieces.append(Piece(photo, np.array(rows), fine, len(rows), (0, 0, 1, 1), False))
 
     def box(one: Joined):
         return upright_box(points[one.rows], weight[one.rows], np.eye(3))
 
     expected = grown(without_crumbs(join(pieces, weight, box)), 400)
-    given = [{"view": int(p.photo), "rows": p.rows.tolist(), "resolution": p.resolution, "area": p.area,
-              "cut": p.cut} for p in pieces]  # fmt: skip
+    given = [{"view": int(p.photo), "rows": p.rows.tolist(), "resolution": p.resolution, "cut": p.cut}
+             for p in pieces]  # fmt: skip
     body = """const edges = [[1, 0, 0], [0, 1, 0], [0, 0, 1]];
       const box = ({ rows }) => m.uprightBox(rows, given.points, given.weight, edges);
       return m.grown(m.withoutCrumbs(m.join(given.pieces, given.weight, box)), 400).map(
@@ -195,6 +194,13 @@ def test_things_join_with_those_on_or_around_them_as_in_python(page, least, most
     }
     body = "return m.placed(given.parts, given.boxes).map(({ rows }) => rows.toSorted((a, b) => a - b));"
     assert sorted(module(page, "things", body, given)) == expected
+
+
+def test_a_word_that_hardly_fits_is_perhaps_there_as_in_python(page):
+    peaks = [LEVELS[0] - 0.01, LEVELS[0] + 0.01, PRESENT - 0.01, PRESENT + 0.01]
+    body = """const of = (peak) => Float32Array.from({ length: 1000 }, (_, i) => (i < 5 ? peak : 0.1));
+      return given.map((peak) => m.presence(of(peak), { best: 0.005 }));"""
+    assert module(page, "things", body, peaks) == [0, 1, 1, 2]
 
 
 def test_boxes_are_those_of_python(page):
