@@ -6,20 +6,19 @@ import json
 from dataclasses import dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Literal
 
 import numpy as np
 import torch
 from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataParserConfig, DataparserOutputs
 from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
-from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.plugins.registry_dataparser import DataParserSpecification
 from torch import Tensor
 
 from lang3dxl_ns.common.console import say, silence_libraries
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.common.files import expanded, write_atomically
+from lang3dxl_ns.common.files import write_atomically
 from lang3dxl_ns.common.settings_help import without
 from lang3dxl_ns.plugin.cameras import to_nerfstudio
 from lang3dxl_ns.plugin.inert_settings import OF_COLMAP
@@ -28,7 +27,6 @@ from lang3dxl_ns.scene.capture import Capture, CaptureSettings, Split, find_sour
 from lang3dxl_ns.scene.colmap import Reconstruction, TrackedPhoto
 from lang3dxl_ns.scene.frame import Center, Frame, Orientation
 from lang3dxl_ns.scene.record import SCENE_FILE, SceneRecord
-from lang3dxl_ns.scene.transforms import TRANSFORMS
 
 
 @without(*OF_COLMAP)
@@ -185,10 +183,7 @@ def parser_for(
 ) -> PhotoCollectionDataParserConfig:
     """Choose the dataparser for `config.data`, and note in it which model it found, so that a resumed run
     finds the same. Photos without a model are reconstructed, if allowed; a video becomes a folder of frames.
-    Scenes of nerfstudio's own transforms.json are read here as well. Raises UserError if the photos don't
-    make a scene, and for nerfstudio's other dataparsers."""
-    if isinstance(config, NerfstudioDataParserConfig):
-        config = _of_nerfstudio(config)
+    Raises UserError if the photos don't make a scene, and for nerfstudio's own dataparsers."""
     if not isinstance(config, PhotoCollectionDataParserConfig):
         raise UserError(
             f"{type(config).__name__} is not read here: leave the dataparser's name off, so that the COLMAP "
@@ -203,27 +198,6 @@ def parser_for(
         if settings.colmap_path is None:
             config.colmap_path = source.relative_to(folder) if source.is_relative_to(folder) else source
     return config
-
-
-def _of_nerfstudio(config: NerfstudioDataParserConfig) -> PhotoCollectionDataParserConfig:
-    """Return the settings by which this package reads the same scene in the same frame. Every eighth photo is
-    held out instead of a tenth. Raises UserError for choices that this package doesn't have."""
-    offered = {"eval_mode": ("fraction", "interval", "all")}
-    offered |= {"orientation_method": get_args(Orientation), "center_method": get_args(Center)}
-    for name, known in offered.items():
-        if (choice := getattr(config, name)) not in known:
-            option = f"--{name.replace('_', '-')}"
-            raise UserError(f"{option} {choice} is not known here: choose one of {', '.join(known)}")
-    data = expanded(config.data)
-    data = data if data.suffix == ".json" else data / TRANSFORMS
-    if not data.exists():
-        raise UserError(f"there is no {data}: give its folder as --data, or the file itself")
-    shared = {f.name for f in fields(PhotoCollectionDataParserConfig)} & {f.name for f in fields(config)}
-    values: dict[str, Any] = {
-        name: getattr(config, name) for name in shared - {"_target", "data", "downscale_factor"}
-    }
-    values["eval_mode"] = "all" if config.eval_mode == "all" else "interval"
-    return PhotoCollectionDataParserConfig(data=data, **values)
 
 
 silence_libraries()  # nerfstudio imports this module before the libraries that warn

@@ -128,12 +128,12 @@ def test_export_splat(run, folder):
 
 
 def test_transforms_json_scenes_train_too(scene, tiny_clip, tiny_dense, folder):
-    """nerfstudio-data, as LERF-OVS and DL3DV scenes come: no tracks, so sizes come from the seed points."""
+    """As LERF-OVS and DL3DV scenes come: no tracks, so sizes come from the seed points."""
     data = transforms_scene(scene, folder / "transforms_scene")
     output = command(
         *("ns-train", "lang3dxl", "--data", data, "--max-num-iterations", 5, "--vis", "tensorboard"),
         *("--pipeline.datamanager.clip", tiny_clip, "--pipeline.datamanager.dense", tiny_dense, *FEW),
-        *("--output-dir", folder / "outputs", "nerfstudio-data"),
+        *("--output-dir", folder / "outputs"),
         cwd=folder,
     )
     assert "crop sides" in output
@@ -145,7 +145,7 @@ def test_transforms_json_without_points_takes_relative_crops(scene, tiny_clip, t
         *("ns-train", "lang3dxl", "--data", data, "--max-num-iterations", 3, "--vis", "tensorboard"),
         *("--pipeline.datamanager.clip", tiny_clip, "--pipeline.datamanager.dense", tiny_dense, *FEW),
         *("--pipeline.model.random-init", "True", "--pipeline.model.num-random", 200),
-        *("--output-dir", folder / "outputs", "nerfstudio-data"),
+        *("--output-dir", folder / "outputs"),
         cwd=folder,
     )
     assert "no 3D points" in output

