@@ -29,7 +29,6 @@ from lang3dxl_ns.preparation.regions import FolderRegions
 from lang3dxl_ns.preparation.store import FeatureStore
 from lang3dxl_ns.query.vocabulary import whole_words
 from lang3dxl_ns.scene.camera import Lens
-from lang3dxl_ns.scene.camera_path import read_camera_path
 from lang3dxl_ns.scene.colmap import read_reconstruction
 from lang3dxl_ns.scene.companions import companion, inside
 from lang3dxl_ns.scene.photo import Photo
@@ -179,12 +178,10 @@ def test_presets(content, tmp_path, monkeypatch):
 
 @fuzz
 @given(content=st.binary(max_size=60) | JSON.map(lambda value: json.dumps(value).encode()))
-def test_scene_files_and_camera_paths(content, tmp_path):
+def test_scene_files(content, tmp_path):
     (tmp_path / "a.json").write_bytes(content)
     with only_user_errors():
         SceneRecord.read(tmp_path / "a.json")
-    with only_user_errors():
-        read_camera_path(tmp_path / "a.json")
 
 
 @st.composite
@@ -221,22 +218,6 @@ def test_scene_files_in_use(tmp_path, data):
             assert scene.photo(photo.name) is photo
             assert photo.camera.at_origin(torch.zeros(1))[1].isfinite().all()
             assert photo.foreground() is None or max(photo.lens.width, photo.lens.height) < 1e5
-
-
-@fuzz
-@given(data=st.data())
-def test_camera_paths_in_use(tmp_path, data):
-    frame = {
-        "camera_to_world": [value for row in [*POSE, [0.0, 0.0, 0.0, 1.0]] for value in row],
-        "fov": 60.0,
-        "aspect": 1.5,
-    }
-    document = {"render_width": 24, "render_height": 16, "camera_path": [frame, frame]}
-    (tmp_path / "a.json").write_text(json.dumps(data.draw(altered(document))))
-    with only_user_errors():
-        for camera in read_camera_path(tmp_path / "a.json"):
-            assert camera.width > 0 and camera.height > 0
-            assert camera.intrinsics.isfinite().all() and camera.view_matrix.isfinite().all()
 
 
 @fuzz

@@ -31,8 +31,6 @@ from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.query.text import Prompt, caution, listed_phrases, parse_prompts
 from lang3dxl_ns.query.trust import Trust
 from lang3dxl_ns.query.vocabulary import whole_words
-from lang3dxl_ns.scene.camera import Camera
-from lang3dxl_ns.scene.camera_path import read_camera_path
 from lang3dxl_ns.web.video import RATE, tour_shots, write_video
 from lang3dxl_ns.web.write_page import Page, write_page
 from lang3dxl_ns.words.taught_words import run_lengths
@@ -41,21 +39,20 @@ _LEAST_PART = 1e-4
 """Share of a photo below which a separate part of a mask is no label."""
 _NEAREST = Image.Resampling.NEAREST
 _READ_BY: dict[str, tuple[str, ...]] = dict.fromkeys(("title", "credit", "license"), ("web", "scene_file"))
-_READ_BY |= {"text": ("out", "web", "video"), "not_": ("out", "web", "video"), "look": ("out", "web")}
+_READ_BY |= dict.fromkeys(("text", "not_", "look"), ("out", "web"))
 _READ_BY |= {"vocabulary": ("web",), "photos": ("web",), "all": ("out",), "hide_floaters": ("out",)}
-_READ_BY |= {"camera_path": ("video",)}
 """Targets of `export` that read an option. Options that are not listed are read by every target."""
 _Not = Annotated[tyro.conf.UseAppendAction[list[str]], tyro.conf.arg(name="not")]
 
 
-@showing("scene", "text", "not_", "out", "image", "all", "camera_path", "coco", "settings")
+@showing("scene", "text", "not_", "out", "image", "all", "coco", "settings")
 @dataclass(kw_only=True)
 class Query:
     """Search a trained scene for texts: write heat maps, masks and relevancy maps.
 
     Each text gets a folder in --out. For every view, it holds `….overlay.png` (heat map over the rendering),
     `….mask.png` and `….npy` (relevancy, float32). `query.json` lists prompts and results. Without --image,
-    --all or --camera-path, each text gets the training view that shows it best. Views that several texts
+    --all, each text gets the training view that shows it best. Views that several texts
     share are also written as one picture to `together`, with a color for each text and a legend.
     """
 
@@ -71,8 +68,6 @@ class Query:
     """Use the view of this photo, by name."""
     all: bool = False
     """Use the views of all photos, including held-out ones."""
-    camera_path: Path | None = None
-    """Use the views of a camera path saved by the viewer."""
     coco: Path | None = None
     """COCO file to which the masks of all photos and texts are also written as labels. It needs --all."""
     without_taught: bool = False
@@ -89,8 +84,8 @@ class Query:
         if self.coco is not None and self.coco.is_file() and self.coco.stat().st_size:
             with readable(f"{self.coco} is another file than one of labels", "choose another name"):
                 expect({"images", "annotations"} <= {*read_json(self.coco, 1 << 31)}, "it has no annotations")
-        if sum((self.image is not None, self.all, self.camera_path is not None)) > 1:
-            raise UserError("--image, --all and --camera-path exclude each other: give one of them")
+        if self.image is not None and self.all:
+            raise UserError("--image and --all exclude each other: give one of them")
         prompts = parse_texts(self.text, self.not_)  # fail now rather than after the work
         if not prompts:
             raise UserError("there is no --text: say what to look for, such as --text windows")
@@ -111,7 +106,7 @@ class Query:
                 save_picture(match.mask * np.uint8(255), folders[i] / f"{name}.mask.png")
                 where = f"pixel {match.peak[0]}, {match.peak[1]} of {name}"
                 best[i] = max(best[i], (match.area > 0, match.score, where))
-            if self.coco is not None and isinstance(place, str):
+            if self.coco is not None:
                 size = scene.file.photo(place).file_size
                 masks = [Image.fromarray(match.mask).resize(size, _NEAREST) for match in matches]
                 labels.add(place, [np.asarray(mask) for mask in masks])
@@ -138,11 +133,9 @@ class Query:
         if old := sorted({path.parent.name for path in {*ours} - written}):
             say(f"{self.out} still has files of an earlier query, not listed in query.json: {some(old)}")
 
-    def _places(self, scene: Scene, question: Question) -> list[tuple[str, Camera | str, Sequence[int]]]:
-        """List file name (no suffix), camera or photo, and prompts of every requested view."""
+    def _places(self, scene: Scene, question: Question) -> list[tuple[str, str, Sequence[int]]]:
+        """List file name (no suffix), photo, and prompts of every requested view."""
         everything: Sequence[int] = range(len(question.prompts))
-        if self.camera_path is not None:
-            return [(f"{i:05d}", c, everything) for i, c in enumerate(read_camera_path(self.camera_path))]
         if self.all:
             asked = {photo.name: everything for photo in scene.photos}
         elif self.image is not None:
@@ -245,8 +238,6 @@ class Export:
     """Folder for a web page that any static server can serve."""
     video: Path | None = None
     """Video to write, such as out.mp4, of the tour that the page kept in the scene's file (needs ffmpeg)."""
-    camera_path: Path | None = None
-    """Camera path saved by nerfstudio's viewer, for --video in place of the tour, with the heat of --text."""
     vocabulary: Path | None = None
     """File of more words that may name a place on the page, one per line."""
     photos: Path | None = None
@@ -309,9 +300,7 @@ class Export:
             see = f"python -m http.server -d {shlex.quote(str(self.web))}"
             say(f"Wrote {size / 1e6:.1f} MB to {self.web}; see it: {see}")
         if self.video is not None:
-            path = [] if self.camera_path is None else read_camera_path(self.camera_path)
-            shots = [(camera, prompts, "", 1) for camera in path] or tour_shots(scene, self._told().tour)
-            count = write_video(self.video, scene, shots)
+            count = write_video(self.video, scene, tour_shots(scene, self._told().tour))
             say(f"Wrote {count} pictures, {count / RATE:.0f} seconds, to {self.video}")
         if self.out is not None:
             text = prompts[0] if prompts else None

@@ -1,7 +1,8 @@
-"""Videos of a flight along a tour or a camera path, with the heat of words and captions (ffmpeg)."""
+"""Videos of a flight along a tour, with the heat of words and captions (ffmpeg)."""
 
 from __future__ import annotations
 
+import math
 import os
 import shutil
 import subprocess
@@ -11,6 +12,7 @@ from pathlib import Path
 from urllib.parse import parse_qsl
 
 import numpy as np
+import torch
 from jaxtyping import Float64
 from numpy import ndarray as Array
 from PIL import Image, ImageDraw, ImageFont
@@ -22,8 +24,7 @@ from lang3dxl_ns.common.files import expanded
 from lang3dxl_ns.query.match import together
 from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.query.text import Prompt, parse_prompts
-from lang3dxl_ns.scene.camera import Camera
-from lang3dxl_ns.scene.camera_path import path_camera
+from lang3dxl_ns.scene.camera import Camera, Lens, check_pose, view_matrix
 from lang3dxl_ns.things.find import up_of
 
 RATE, SIZE = 25, (1280, 720)
@@ -49,7 +50,7 @@ def tour_shots(scene: Scene, tour: str, size: tuple[int, int] = SIZE) -> list[Sh
                 shots.append((camera, prompts, caption, 1))
             shots[-1] = (*shots[-1][:3], int(RATE * min(_PAUSE + _LETTER * len(caption), _LONGEST)))
     if not shots:
-        raise UserError("there is no tour: keep views in the page of lang3dxl view, or give --camera-path")
+        raise UserError("there is no tour: keep views in the page of lang3dxl view")
     return shots
 
 
@@ -66,7 +67,11 @@ def _camera(stand: Float64[Array, "7"], up: Float64[Array, "3"], size: tuple[int
     right = np.cross(up + 1e-6 * np.roll(up, 1), back)  # also for a look straight down
     right /= np.linalg.norm(right)
     pose = np.vstack([np.stack([right, np.cross(back, right), back, stand[:3]], axis=1), [0, 0, 0, 1]])
-    return path_camera({"camera_to_world": pose.tolist(), "fov": float(stand[6])}, *size)
+    check_pose(pose.tolist())
+    expect(0 < stand[6] < 180, f"a view is {stand[6]} degrees wide")
+    focal = size[1] / 2 / math.tan(math.radians(stand[6]) / 2)
+    lens = Lens(*size, focal, focal, size[0] / 2, size[1] / 2)
+    return lens.camera(view_matrix(torch.from_numpy(pose[:3]).float()))
 
 
 def write_video(path: Path, scene: Scene, shots: Sequence[Shot]) -> int:

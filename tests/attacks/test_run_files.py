@@ -1,4 +1,4 @@
-"""Scene files and camera paths with wrong contents: one line that names the file."""
+"""Scene files with wrong contents: one line that names the file."""
 
 import json
 import math
@@ -10,7 +10,6 @@ from lab.landmark.novel_views import read_novel_views
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.preparation.needs import NEEDS_FILE, read_needs
 from lang3dxl_ns.scene.camera import Lens
-from lang3dxl_ns.scene.camera_path import read_camera_path
 from lang3dxl_ns.scene.record import ScenePhoto, SceneRecord
 
 POSE = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 2.0]]
@@ -117,66 +116,13 @@ def test_damaged_test_views_are_named(tmp_path, change):
         read_novel_views(tmp_path)
 
 
-MATRIX = [1.0, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 2, 0, 0, 0, 1]
-
-
-def camera_path(folder, **changes):
-    frame = {"camera_to_world": MATRIX, "fov": 60.0, "aspect": 1.3}
-    content = {"render_width": 40, "render_height": 30, "camera_path": [frame]}
-    for name, value in changes.items():
-        (frame if name in frame else content)[name] = value
-    text = json.dumps(content)
-    (folder / "path.json").write_text(text.replace('"1e309"', "1e309"))
-    return folder / "path.json"
-
-
-@pytest.mark.parametrize(
-    "changes",
-    [
-        {"fov": 0},
-        {"fov": -60},
-        {"fov": 180},
-        {"fov": 1e9},
-        {"fov": math.nan},
-        {"fov": "60"},
-        {"render_width": 0},
-        {"render_width": -40},
-        {"render_width": 2_000_000},
-        {"render_width": "1e309"},
-        {"render_width": None},
-        {"render_height": 0},
-        {"render_width": 60_000, "render_height": 60_000},
-        {"camera_path": []},
-        {"camera_path": 3},
-        {"camera_path": [3]},
-        {"camera_to_world": MATRIX[:12]},
-        {"camera_to_world": [0.0] * 16},
-        {"camera_to_world": [math.nan] * 16},
-        {"camera_to_world": [1e300] * 16},
-    ],
-)
-def test_a_camera_path_that_nothing_can_be_rendered_from_is_named(tmp_path, changes):
-    assert len(read_camera_path(camera_path(tmp_path))) == 1
-    with pytest.raises(UserError, match=r"path\.json is not a camera path"):
-        read_camera_path(camera_path(tmp_path, **changes))
-
-
 def test_poses_written_as_integers_are_poses(tmp_path):
     whole = [[int(value) for value in row] for row in POSE]
     path = scene_file(tmp_path, set_of_photo("camera_to_world", whole))
     assert SceneRecord.read(path).photos[1].camera.view_matrix.is_floating_point()
 
 
-@pytest.mark.parametrize("content", [None, "", "{}", '{"render_width": 1, "camera_path": [{}]}'])
-def test_a_camera_path_that_is_none_is_named(tmp_path, content):
-    if content is not None:
-        (tmp_path / "path.json").write_text(content)
-    with pytest.raises(UserError, match="is not a camera path"):
-        read_camera_path(tmp_path / "path.json")
-
-
-@pytest.mark.parametrize("read", [SceneRecord.read, read_camera_path])
-def test_pipes_are_refused_instead_of_waited_for(tmp_path, read):
+def test_pipes_are_refused_instead_of_waited_for(tmp_path):
     os.mkfifo(tmp_path / "file.json")
     with pytest.raises(UserError, match=r"file\.json"):
-        read(tmp_path / "file.json")
+        SceneRecord.read(tmp_path / "file.json")

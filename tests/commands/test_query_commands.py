@@ -5,7 +5,6 @@ import os
 
 import numpy as np
 import pytest
-import torch
 from painted_scene import COUNT, painted_gaussians, painted_scene
 from PIL import Image
 
@@ -93,25 +92,6 @@ def test_files_of_an_earlier_query_stay_and_are_told(run, tmp_path, capsys):
 def test_all_photos_are_asked(run, tmp_path):
     run("query", "c", "--text", "dome", "--all", "--out", tmp_path)
     assert len(list((tmp_path / "dome").glob("*.npy"))) == 4
-
-
-def test_a_camera_path_is_followed(run, tmp_path):
-    pose = torch.diag(torch.tensor([1.0, -1, -1, 1]))
-    pose[2, 3] = -5
-    frame = {"camera_to_world": pose.flatten().tolist(), "fov": 60.0}
-    path = {"render_width": 30, "render_height": 20, "camera_path": [frame, frame]}
-    (tmp_path / "path.json").write_text(json.dumps(path))
-    run(
-        "query",
-        "c",
-        "--text",
-        "dome",
-        "--camera-path",
-        tmp_path / "path.json",
-        "--out",
-        tmp_path,
-    )
-    assert np.load(tmp_path / "dome" / "00001.npy").shape == (20, 30)
 
 
 @pytest.mark.parametrize(

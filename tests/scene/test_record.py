@@ -1,7 +1,6 @@
 """The scene description in a run's folder."""
 
 import json
-import math
 from dataclasses import asdict
 
 import numpy as np
@@ -12,7 +11,6 @@ from PIL import Image
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.scene.camera import Lens, camera_to_world, posed, resized, view_matrix
-from lang3dxl_ns.scene.camera_path import read_camera_path
 from lang3dxl_ns.scene.photo import Photo, turned_lens
 from lang3dxl_ns.scene.reconstruction import REPORT, ReconstructionReport, doubtful_photos
 from lang3dxl_ns.scene.record import ScenePhoto, SceneRecord
@@ -110,14 +108,3 @@ def test_a_posed_camera_has_the_lens_of_another(file):
     again = posed(camera_to_world(camera.view_matrix), like=camera)
     torch.testing.assert_close(again.view_matrix, camera.view_matrix)
     assert torch.equal(again.intrinsics, camera.intrinsics)
-
-
-def test_a_camera_path_of_the_viewer_is_read(tmp_path):
-    frame = {"camera_to_world": torch.eye(4).flatten().tolist(), "fov": 90.0, "aspect": 1.5}
-    path = tmp_path / "path.json"
-    path.write_text(json.dumps({"render_width": 60, "render_height": 40, "camera_path": [frame, frame]}))
-    cameras = read_camera_path(path)
-    assert len(cameras) == 2
-    # 90 degrees from top to bottom: half the height is one focal length away.
-    assert cameras[0].intrinsics[1, 1] == pytest.approx(20 / math.tan(math.pi / 4))
-    torch.testing.assert_close(cameras[0].view_matrix, torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0])))
