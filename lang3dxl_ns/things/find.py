@@ -41,7 +41,7 @@ MISSED = 1.4
 hold on six of six validation landmarks, and with the candidates alone on four."""
 PRESENT = 0.9
 """Peak of a word from which what it finds are things; below, they are candidates. Words for what is there
-reach 1.00 on six validation landmarks, five of six look-alikes of what isn't .31 to .81."""
+reach 1.00 on validation landmarks, four of five look-alikes of what isn't .31 to .81."""
 SAME = 0.5
 """Overlap (intersection over union of weights) from which two words' things are one."""
 
