@@ -124,7 +124,10 @@ def add_photos(
     told = reasons_in_words({"without a place": lost, "doubtfully placed": doubtful})
     if not found:
         raise UserError(f"none of the {len(targets)} new photos finds a place; {'; '.join(told)}")
-    _copy(images, {name: targets[name] for name in found})
+    for name in found:
+        if not (images / targets[name]).exists():
+            make_folder((images / targets[name]).parent)
+            shutil.copy2(images / name, images / targets[name])
     for image in numbers.values():
         model.extract_colors_for_image(image, images)  # only of points without a color
     kept = _replace(place, model, work.parent)
@@ -324,14 +327,6 @@ def _triangulate(
     for number in added.values():
         pycolmap.IncrementalTriangulator(matches, model).triangulate_image(options, number)
     pycolmap.ObservationManager(model, matches).filter_points3D(*_SOUND, set(model.points3D) - known)
-
-
-def _copy(images: Path, targets: dict[str, str]) -> None:
-    """Copy photos from where they are to where they belong."""
-    for name, target in targets.items():
-        if not (images / target).exists():
-            make_folder((images / target).parent)
-            shutil.copy2(images / name, images / target)
 
 
 def _report(path: Path, photos: int, placed: int, doubtful: dict[str, str]) -> None:

@@ -13,6 +13,11 @@ from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import UInt8
+from numpy import ndarray as Array
 
 from lang3dxl_ns.common.console import progress
 from lang3dxl_ns.common.errors import DAMAGE, is_plain
@@ -25,6 +30,9 @@ from lang3dxl_ns.scene.pairing import pairs_to_match
 from lang3dxl_ns.scene.photo_folder import PhotoFolder, find_photos, readable, shared_cameras
 from lang3dxl_ns.scene.placements import LEAST_MATCHES
 from lang3dxl_ns.scene.reconstruction import ReconstructionSettings
+
+if TYPE_CHECKING:
+    import pycolmap
 
 _MEMORY_PER_THREAD = 1e9  # bytes that SIFT takes on a photo of 1600 pixels, the default `max_size`
 _ENDINGS = {"JPEG": ".jpg", "MPO": ".jpg", "PNG": ".png", "TIFF": ".tif", "BMP": ".bmp"}
@@ -139,8 +147,7 @@ def match(
         ids = {image.name: image.image_id for image in db.read_all_images()}
         known = [n for n in names if n in ids and db.num_keypoints_for_image(ids[n])]
         learned = LearnedMatcher(database, known) if settings.features == "xfeat" else None
-        read = db.read_descriptors
-        pairs = learned.pairs() if learned else pairs_to_match(known, lambda name: read(ids[name]).data)
+        pairs = learned.pairs() if learned else pairs_to_match(known, lambda name: largest(db, ids[name]))
         has = db.exists_matches, db.exists_two_view_geometry
         wanted = [pair for pair in pairs if not new.isdisjoint(pair)]
         missing = [(a, b) for a, b in wanted if not all(there(ids[a], ids[b]) for there in has)]
@@ -159,6 +166,13 @@ def match(
             else:
                 pycolmap.match_image_pairs(database, options, pairing)
             advance(len(chunk))
+
+
+def largest(database: pycolmap.Database, number: int) -> UInt8[Array, "n 128"]:
+    """Read the SIFT descriptors of a photo's features, the largest first."""
+    a, b, c, d = database.read_keypoints(number)[:, 2:6].T  # shape, as an affine matrix
+    order = np.argsort(-abs(a * d - b * c), kind="stable")
+    return database.read_descriptors(number).data[order]
 
 
 def features_and_partners(database: Path) -> tuple[dict[str, int], Counter[str]]:

@@ -13,12 +13,14 @@ EXHAUSTIVE = 200
 """Largest number of photos for which every pair is matched, which makes 19,900 pairs."""
 NEIGHBORS = 40
 """Most similar photos with which each photo is paired in larger collections."""
-_WORDS = 64
-_SAMPLE = 50_000  # descriptors for learning the words
-_PER_PHOTO = 1_500  # descriptors per photo
+_WORDS, _PER_WORD = 512, 32
+"""Most visual words, and fewest features for each of them."""
+_PER_PHOTO = 500
+"""Features per photo that tell how it looks: the largest, which others see from afar too."""
+_TEACHERS = 200  # photos from whose features the words are learned
 
 Descriptors = Callable[[str], UInt8[Array, "n 128"]]
-"""Function from a photo's name to its SIFT descriptors."""
+"""Function from a photo's name to the SIFT descriptors of its features, the largest first."""
 
 
 def pairs_to_match(names: Sequence[str], descriptors: Descriptors) -> list[tuple[str, str]]:
@@ -38,29 +40,30 @@ def similar_pairs(names: Sequence[str], descriptors: Descriptors, neighbors: int
     from sklearn.cluster import MiniBatchKMeans
     from sklearn.neighbors import NearestNeighbors
 
-    rng = np.random.default_rng(0)
-    some = [names[i] for i in rng.permutation(len(names))[:200]]
-    sample = np.concatenate([_rows(descriptors(name), _SAMPLE // len(some), rng) for name in some])
-    words = MiniBatchKMeans(min(_WORDS, len(sample)), random_state=0, n_init=3).fit(sample).cluster_centers_
-    vectors = np.stack([_aggregate(_rows(descriptors(name), _PER_PHOTO, rng), words) for name in names])
+    some = np.random.default_rng(0).permutation(len(names))[:_TEACHERS]
+    sample = np.concatenate([_rows(descriptors(names[i])) for i in some])
+    count = max(min(_WORDS, len(sample) // _PER_WORD), 1)
+    words = MiniBatchKMeans(count, random_state=0, n_init=3).fit(sample).cluster_centers_
+    vectors = np.stack([_aggregate(_rows(descriptors(name)), words) for name in names])
     search = NearestNeighbors(n_neighbors=min(neighbors, len(names) - 1), metric="cosine").fit(vectors)
     found = enumerate(search.kneighbors(return_distance=False))  # without the photo itself
     return sorted({(names[min(i, j)], names[max(i, j)]) for i, others in found for j in others})
 
 
-def _rows(descriptors: UInt8[Array, "n 128"], most: int, rng: np.random.Generator) -> Float[Array, "m 128"]:
-    """Sample at most `most` rows and convert them to RootSIFT."""
-    chosen = rng.permutation(len(descriptors))[:most]
-    rows = descriptors[chosen].astype(np.float32)
+def _rows(descriptors: UInt8[Array, "n 128"]) -> Float[Array, "m 128"]:
+    """Convert the descriptors of the largest features to RootSIFT."""
+    rows = descriptors[:_PER_PHOTO].astype(np.float32)
     return np.sqrt(rows / np.maximum(rows.sum(1, keepdims=True), 1e-9))
 
 
 def _aggregate(rows: Float[Array, "n 128"], words: Float[Array, "k 128"]) -> Float[Array, " d"]:
-    """Sum the descriptors' differences from their nearest words, normalized per word and overall."""
+    """Sum the descriptors' differences from their nearest words, as roots, so that what repeats counts less,
+    normalized per word and overall."""
     if not len(rows):
         return np.zeros(words.size, np.float32)
     nearest = (np.square(words).sum(1) - 2 * rows @ words.T).argmin(1)
     total = np.zeros_like(words)
     np.add.at(total, nearest, rows - words[nearest])
+    total = np.sign(total) * np.sqrt(abs(total))
     total /= np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-9)
     return (total / max(np.linalg.norm(total), 1e-9)).ravel()

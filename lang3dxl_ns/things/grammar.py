@@ -95,10 +95,8 @@ def parse(text: str) -> Request:
     rest = " ".join(text.lower().strip(" ?!.").split())
     count, rest = _taken(rest, words["count"])
     _, rest = _taken(rest, words["lead"])
-    idle = (
-        rf" (?:that |which )?(?:are|is)(?: there)?(?= (?:{_any(words['relations'])}) )"
-        rf"| (?:{_any(words['tail'])})$"
-    )
+    relation, tail = _any(words["relations"]), _any(words["tail"])
+    idle = rf" (?:that |which )?(?:are|is)(?: there)?(?= (?:{relation}) )| (?:{tail})$"
     return replace(_request(re.sub(idle, "", rest)), count=count)
 
 
