@@ -1,6 +1,6 @@
 """Recall of the pairs that `reconstruct` matches in a large collection, whose true model is known.
 
-    lang3dxl demo-scene --seed 601 --photos 1000 --width 640 --height 480 --weathered --out TRUE
+    lang3dxl demo-scene --family cathedral --seed 601 --photos 1000 --weathered --out TRUE
     python -m lab.benchmarks.pairs --true TRUE --work DIR
 
 A true pair shares at least 15 % of the points of the photo with fewer, seen less than 30° apart.
