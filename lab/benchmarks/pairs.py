@@ -19,7 +19,7 @@ from jaxtyping import Bool
 from numpy import ndarray as Array
 from scipy.sparse import csr_matrix
 
-from lang3dxl_ns.scene.matching import extract, feature_database, largest, numbered
+from lang3dxl_ns.scene.matching import extract, feature_database, largest, numbered, quiet
 from lang3dxl_ns.scene.pairing import similar_pairs
 from lang3dxl_ns.scene.photo_folder import find_photos
 from lang3dxl_ns.scene.reconstruction import ReconstructionSettings
@@ -57,8 +57,9 @@ def main(config: Pairs) -> None:
     photos, settings = find_photos(config.true), ReconstructionSettings(features="sift")
     config.work.mkdir(parents=True, exist_ok=True)
     copies = numbered(photos, config.work)
-    database = feature_database(photos, copies, config.work, settings)
-    extract(database, copies, settings)
+    with quiet():
+        database = feature_database(photos, copies, config.work, settings)
+        extract(database, copies, settings)
     truth = true_pairs(pycolmap.Reconstruction(config.true / "sparse/0"), list(photos.names))
     partners = truth.sum(1)
     with pycolmap.Database.open(database) as db:
