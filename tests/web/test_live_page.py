@@ -224,6 +224,7 @@ def test_a_page_whose_server_is_gone_says_so_also_with_a_folded_panel(browser, f
         name.fill("gizmo")
         name.press("Enter")
         page.get_by_text("server of this page doesn't answer").wait_for()
+        page.context.unroute_all()  # all pages of these tests are in one
         page.close()
 
 
