@@ -51,9 +51,9 @@ class Query:
     """Search a trained scene for texts: write heat maps, masks and relevancy maps.
 
     Each text gets a folder in --out. For every view, it holds `….overlay.png` (heat map over the rendering),
-    `….mask.png` and `….npy` (relevancy, float32). `query.json` lists prompts and results. Without --image,
-    --all, each text gets the training view that shows it best. Views that several texts
-    share are also written as one picture to `together`, with a color for each text and a legend.
+    `….mask.png` and `….npy` (relevancy, float32). `query.json` lists prompts and results. Without --image
+    or --all, each text gets the training view that shows it best. Views that several texts share are also
+    written as one picture to `together`, with a color for each text and a legend.
     """
 
     scene: tyro.conf.Positional[Path | None] = None

@@ -132,20 +132,18 @@ def grown(things: Sequence[Joined], count: int) -> list[Joined]:
 def placed(things: Sequence[Joined], boxes: Sequence[Box]) -> list[Joined]:
     """Unite things whose boxes overlap, slim things with what stands on or below them (a minaret's shaft, its
     balcony and its tip), and deep things with what crowns them. `boxes` are the things' upright boxes."""
-    pairs = []
+    pairs = list[tuple[int, int]]()
+    centers, extents = (np.array([box[part] for box in boxes]).reshape(-1, 3) for part in (0, 2))
     for a, (center, axes, size) in enumerate(boxes):
-        wide = size[:2].max()
-        for b, (other, _, extent) in enumerate(boxes):
-            *aside, high = axes @ (other - center)
-            gap = abs(high) - (size[2] + extent[2]) / 2
-            shared = np.minimum((size + extent) / 2 - abs(np.array([*aside, high])), np.minimum(size, extent))
-            common = shared.clip(0).prod()
-            overlap = common > OVERLAP * (size.prod() + extent.prod() - common)
-            slim = size[2] >= SLIM * wide and np.hypot(*aside) < STRAIGHT * wide and gap < size[2]
-            small = extent[:2].max() < CROWN[0] * wide and np.abs(aside).max() < CROWN[1] * wide
-            crown = small and size[:2].min() > ROUND * wide and high > 0 and gap < size[2]
-            if a != b and (overlap or slim or crown):
-                pairs.append((a, b))
+        wide, apart, high = size[:2].max(), abs((centers - center) @ axes.T), (centers - center) @ axes[2]
+        common = np.minimum((size + extents) / 2 - apart, np.minimum(size, extents)).clip(0).prod(1)
+        overlap = common > OVERLAP * (size.prod() + extents.prod(1) - common)
+        near = apart[:, 2] - (size[2] + extents[:, 2]) / 2 < size[2]
+        slim = (size[2] >= SLIM * wide) & (np.hypot(apart[:, 0], apart[:, 1]) < STRAIGHT * wide)
+        small = (extents[:, :2].max(1) < CROWN[0] * wide) & (apart[:, :2].max(1) < CROWN[1] * wide)
+        crown = small & (size[:2].min() > ROUND * wide) & (high > 0)
+        found = np.flatnonzero(overlap | (near & (slim | crown))).tolist()
+        pairs += [(a, b) for b in found if b != a]
     return _grouped(things, _groups(len(things), pairs))
 
 
