@@ -1,4 +1,5 @@
-"""Questions about things: counts, superlatives, ordinals and relations, from one table (`grammar.json`)."""
+"""Questions about things: counts, superlatives, ordinals and relations, from one table (`grammar.json`). How
+a question begins tells the table of what people type (`query/language.json`)."""
 
 from __future__ import annotations
 
@@ -16,6 +17,7 @@ from numpy import ndarray as Array
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import read_json
+from lang3dxl_ns.query.language import TABLE
 from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.things.find import MISSED, Things, up_of
 from lang3dxl_ns.things.thing import Thing
@@ -93,8 +95,8 @@ def parse(text: str) -> Request:
     """Parse a question. Raises UserError, which names the part, for what the grammar doesn't know."""
     words = table()
     rest = " ".join(text.lower().strip(" ?!.").split())
-    count, rest = _taken(rest, words["count"])
-    _, rest = _taken(rest, words["lead"])
+    count, rest = _taken(rest, TABLE["count"])
+    _, rest = _taken(rest, TABLE["lead"])
     relation, tail = _any(words["relations"]), _any(words["tail"])
     idle = rf" (?:that |which )?(?:are|is)(?: there)?(?= (?:{relation}) )| (?:{tail})$"
     return replace(_request(re.sub(idle, "", rest)), count=count)
@@ -255,7 +257,7 @@ def _taken(text: str, phrases: list[str]) -> tuple[bool, str]:
 
 
 def _plain(text: str) -> str:
-    return re.sub(rf"^(?:(?:{_any(table()['articles'])})\s+)+", "", text.strip())
+    return re.sub(rf"^(?:(?:{_any(TABLE['articles'])})\s+)+", "", text.strip())
 
 
 def _any(phrases: Iterable[str]) -> str:

@@ -5,15 +5,15 @@ import language from "./language.js";
 const { grammar } = language, { BESIDE, INSIDE, CLOSE, VIEWS, SURE, MISSED } = language.things;
 const has = (table, word) => Object.hasOwn(table, word);
 const any = (phrases) => [...(Array.isArray(phrases) ? phrases : Object.keys(phrases))].sort((a, b) => b.length - a.length).join("|");
-const plain = (text) => text.trim().replace(new RegExp(`^(?:(?:${any(grammar.articles)})\\s+)+`), "");
+const plain = (text) => text.trim().replace(new RegExp(`^(?:(?:${any(language.articles)})\\s+)+`), "");
 
 /** Parse a question: { word, count, superlative, nth, along, relation, others: what it refers to, without }. Throws an
  * error, which names the part, for what the grammar doesn't know. */
 export function parse(text) {
   let rest = text.toLowerCase().replace(/^[ ?!.]+|[ ?!.]+$/g, "").split(/\s+/).filter(Boolean).join(" ");
   const cut = (pattern) => rest !== (rest = rest.replace(pattern, ""));
-  const count = cut(new RegExp(`^(?:${any(grammar.count)})\\s+`));
-  cut(new RegExp(`^(?:${any(grammar.lead)})\\s+`));
+  const count = cut(new RegExp(`^(?:${any(language.count)})\\s+`));
+  cut(new RegExp(`^(?:${any(language.lead)})\\s+`));
   cut(new RegExp(` (?:that |which )?(?:are|is)(?: there)?(?= (?:${any(grammar.relations)}) )| (?:${any(grammar.tail)})$`, "g"));
   return { ...request(rest), count };
 }
@@ -57,7 +57,7 @@ export function isQuestion(text) {
     const { count, superlative, nth, relation } = parse(text);
     return Boolean(count || superlative || nth || relation);
   } catch {
-    return new RegExp(`^(?:${any(grammar.count)}|how|what|which|why|who|when)\\s`, "i").test(text.trim()); // the grammar says why it has no answer
+    return new RegExp(`^(?:${any(language.count)}|how|what|which|why|who|when)\\s`, "i").test(text.trim()); // the grammar says why it has no answer
   }
 }
 
