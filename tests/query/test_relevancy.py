@@ -67,3 +67,10 @@ def test_a_prompt_without_words_or_rivals_is_refused(vectors):
         Queries.of([prompts[:0]], canonical)
     with pytest.raises(ValueError, match="compete"):
         Queries.of([prompts], canonical[:0])
+
+
+def test_a_prompt_that_is_a_canonical_phrase_is_never_relevant(vectors):
+    features, _, canonical = vectors
+    scores = relevancy(features, canonical, canonical)
+    assert scores.max() <= 0.5
+    torch.testing.assert_close(scores.amax(0), torch.full((len(features),), 0.5))
