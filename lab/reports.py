@@ -6,18 +6,12 @@ import dataclasses
 import io
 import shlex
 import sys
-import time
-from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager
-from functools import wraps
 from multiprocessing import get_context
 from multiprocessing.context import BaseContext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
-
-from lang3dxl_ns.common.reports import synchronize
 
 if TYPE_CHECKING:  # imported where it is used, so that a command's help does not load it
     from matplotlib.figure import Figure
@@ -51,35 +45,6 @@ def reset_host_peak() -> None:
     """Lower the peak memory of this process (`host_peak`) to its present memory, where the system can."""
     if sys.platform == "linux":
         Path("/proc/self/clear_refs").write_text("5")
-
-
-@contextmanager
-def timing(parts: Mapping[str, Sequence[tuple[Any, str]]]) -> Iterator[dict[str, list[float]]]:
-    """Time functions meanwhile. `parts` has for each part its functions, each as the module, class or object
-    that has it, with its name there. Yields the seconds of every call, by part."""
-    seconds: dict[str, list[float]] = defaultdict(list)
-
-    def timed(part: str, function: Callable) -> Callable:
-        @wraps(function)
-        def run(*args: Any, **kwargs: Any) -> Any:
-            synchronize()
-            start = time.perf_counter()
-            found = function(*args, **kwargs)
-            synchronize()
-            seconds[part].append(time.perf_counter() - start)
-            return found
-
-        return run
-
-    places = [(part, *place) for part, found in parts.items() for place in found]
-    functions = [getattr(owner, name) for _, owner, name in places]
-    try:
-        for (part, owner, name), function in zip(places, functions, strict=True):
-            setattr(owner, name, timed(part, function))
-        yield seconds
-    finally:
-        for (_, owner, name), function in zip(places, functions, strict=True):
-            setattr(owner, name, function)
 
 
 def with_flags(config: Settings, flags: str) -> Settings:

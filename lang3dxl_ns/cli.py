@@ -31,12 +31,10 @@ from lang3dxl_ns.common.stopping import end_at_once
 LAB = Path(__file__).parents[1] / "lab"
 BENCHMARKS = {
     "ablation": ("lab.benchmarks.ablation:Ablation", "The method, baselines, and ablations."),
-    "training": ("lab.benchmarks.training:TrainingBenchmark", "A training step by its parts."),
     "gpu": ("lab.benchmarks.gpu:GpuBenchmark", "A GPU: parity, numerics, time, memory, in one file to send."),
     "holyscenes": ("lab.benchmarks.published:HolyScenes", "HolyScenes, beside the published figures."),
     "lerf-ovs": ("lab.benchmarks.published:LerfOvs", "LERF-OVS, beside the published figures."),
     "pt-ovs": ("lab.benchmarks.published:PtOvs", "PT-OVS, scene by scene."),
-    "teaching": ("lab.benchmarks.teaching:TeachingBenchmark", "Words taught by example, beside the text."),
     "trust": ("lab.benchmarks.trust:TrustBenchmark", "Cautions under wrong answers, and under right ones."),
     "page": ("lab.benchmarks.page:PageBenchmark", "Seconds until the page of a scene answers."),
     "things": ("lab.benchmarks.things:ThingsBenchmark", "Single windows and towers: F1, counts, boxes."),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterable
 from itertools import pairwise
 from typing import Any
@@ -29,6 +30,9 @@ class LangSplat(Decoder):
     decoded features are scaled back to the targets' typical length. There are no dense features. The
     published system trains a model for each of three levels of SAM segments; this one uses the targets that
     all decoders share here."""
+
+    seconds = 0.0
+    """Duration of `learn_targets` in this process."""
 
     def __init__(self, clip_dim: int) -> None:
         super().__init__(clip_dim, 0)
@@ -60,6 +64,7 @@ class LangSplat(Decoder):
 
     def learn_targets(self, targets: Callable[[], Iterable[Float[Tensor, "h w clip"]]]) -> None:
         """Train the autoencoder on the scene's targets."""
+        start = time.perf_counter()
         generator = torch.Generator().manual_seed(0)
         features = _sample(targets(), generator).to(self.norm.device)
         with torch.random.fork_rng(devices=[]), torch.enable_grad():
@@ -82,6 +87,7 @@ class LangSplat(Decoder):
         with torch.no_grad():
             mean = F.normalize(features.mean(0, keepdim=True), dim=-1)
             self.first_code.copy_(F.normalize(encoder.eval()(mean), dim=-1)[0])
+        LangSplat.seconds += time.perf_counter() - start
 
 
 def _sample(targets: Iterable[Tensor], generator: torch.Generator) -> Float[Tensor, "n c"]:

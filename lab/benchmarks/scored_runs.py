@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures.process import BrokenProcessPool
 from copy import deepcopy
-from dataclasses import asdict, dataclass
+from dataclasses import FrozenInstanceError, asdict, dataclass, replace
 from functools import cached_property, partial
 from itertools import islice
 from pathlib import Path
@@ -25,7 +25,7 @@ from torch import Tensor
 
 from lab.benchmarks.ablation_rows import CLIPSEG, FINE_TEACHER, LANGSAM, SAM3, SEGMENTERS, Row
 from lab.landmark.novel_views import read_novel_views
-from lab.reports import in_own_process, reset_host_peak, timing, with_flags
+from lab.reports import in_own_process, reset_host_peak, with_flags
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import expanded, write_atomically
 from lang3dxl_ns.common.reports import host_peak
@@ -208,12 +208,20 @@ def run_configuration(run: Run, settings: RunSettings, work: Path) -> Lang3DXLTr
 def apply_changes(config: Any, changes: Mapping[str, Any]) -> None:
     """Set values by their dotted path. Raises AttributeError or KeyError for a path that does not exist."""
     for path, value in changes.items():
-        *owners, name = path.split(".")
-        owner = config
-        for part in owners:
-            owner = owner[part] if isinstance(owner, dict) else getattr(owner, part)
-        getattr(owner, name)
-        setattr(owner, name, value)
+        _changed(config, path, value)
+
+
+def _changed(owner: Any, path: str, value: Any) -> Any:
+    """Return `owner` with a value set by its path, which is another object if `owner` is frozen."""
+    name, _, rest = path.partition(".")
+    held = owner[name] if isinstance(owner, dict) else getattr(owner, name)
+    if (new := _changed(held, rest, value) if rest else value) is held:
+        return owner
+    try:
+        setattr(owner, name, new)
+    except FrozenInstanceError:
+        return replace(owner, **{name: new})
+    return owner
 
 
 # ── inside the process ──────────────────────────────────────────────────────────────────────────────────
@@ -242,10 +250,9 @@ def _train_and_score(run: Run, settings: RunSettings, work: Path) -> dict[str, f
     torch.manual_seed(run.seed)
     trainer: Lang3DXLTrainer = config.setup(local_rank=0, world_size=1)
     start, clock = _now(), time.perf_counter()
-    with timing({"learn": [(LangSplat, "learn_targets")]}) as parts:
-        trainer.setup()
+    trainer.setup()
     set_up = _now() - start
-    learned = set_up * sum(parts["learn"]) / (time.perf_counter() - clock)
+    learned = set_up * LangSplat.seconds / (time.perf_counter() - clock)
     _reset_peak()
     start = _now()
     trainer.train()

@@ -26,7 +26,7 @@ _BEFORE = 0.85
 _LEAST_FRONT = 0.2
 """Share of the views around it before whose surface a floater lies at least."""
 _SIZE, _FRONT, _SEEN, _BIAS = 2.2, 5.0, 3.0, -6.8
-"""Weights of the score's logit; `lab/benchmarks/floaters.py` measures what they hide."""
+"""Weights of the score's logit; docs/lab/speed.md shows what they hide."""
 
 
 def floating(

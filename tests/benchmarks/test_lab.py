@@ -8,7 +8,6 @@ from painted_scene import painted_scene
 
 from lab.benchmarks import attach
 from lab.benchmarks.published import HolyScenes, published_figures
-from lab.benchmarks.teaching import ways
 from lang3dxl_ns import cli
 
 OF_LAB = ["numerics", "demo-scene", *(f"benchmark {name}" for name in cli.BENCHMARKS)]
@@ -61,15 +60,3 @@ def test_ours_stand_beside_the_published_figures_of_their_scene_and_category():
         assert row["AP as published"] == ours and row["Lang3D-XL, published"] == theirs
     assert "| photos pooled | windows | 4 | 0.375 |" in together
     assert "| mean of scenes | windows | " in together and "| 0.550 |" in together
-
-
-@pytest.mark.parametrize("name", ways(2))
-def test_marks_lie_on_the_word(name):
-    mask = np.zeros((40, 60), bool)
-    mask[10:20, 30:50] = True
-    example = ways(2)[name]("x.jpg", mask, (120, 80))
-    for x, y in example.points:
-        assert mask[int((y + 0.5) / 2), int((x + 0.5) / 2)]
-    if example.box is not None:
-        assert example.box == (60, 20, 100, 40)
-    assert example.points or example.complete
