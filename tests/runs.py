@@ -5,6 +5,8 @@ from pathlib import Path
 
 import torch
 
+from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
+
 
 def fitted(data: Path, clip: Path, dense: Path, out: Path, steps: int = 2):
     """A finished `fit.Run`, without nerfstudio, with a small sky and few steps of learning codes."""
@@ -14,7 +16,7 @@ def fitted(data: Path, clip: Path, dense: Path, out: Path, steps: int = 2):
 
     settings = Settings.of("lang3dxl", steps)
     settings.targets.clip, settings.targets.dense = str(clip), str(dense)
-    settings.scene.sky_gaussians, settings.scene.semantic_field.code_dim = 50, 3
+    settings.scene.sky_gaussians, settings.scene.semantic_field = 50, SemanticFieldConfig(code_dim=3)
     settings.scene.decoder.compression.steps = 20
     run = begin(open_capture(data), settings, out, data / "lang3dxl_cache", "cpu")
     run.complete(Stages({"train": 1.0, "words": 1.0}))
@@ -23,6 +25,7 @@ def fitted(data: Path, clip: Path, dense: Path, out: Path, steps: int = 2):
 
 def make_trainer(data, clip, dense, output_dir, iterations, semantics=True, method="lang3dxl", **changes):
     """A trainer of a registered method, configured as the command line would."""
+    from lab.benchmarks.scored_runs import apply_changes
     from lang3dxl_ns.methods import METHODS
 
     config = deepcopy(METHODS[method].config)
@@ -34,14 +37,8 @@ def make_trainer(data, clip, dense, output_dir, iterations, semantics=True, meth
     config.pipeline.model.sky_gaussians = 400
     compression = config.pipeline.model.decoder.compression
     compression.steps, compression.batch = 20, 512
-    config.pipeline.model.semantic_field.code_dim = 3
-    for path, value in changes.items():
-        *owners, name = path.split("__")
-        owner = config
-        for part in owners:
-            owner = getattr(owner, part)
-        assert hasattr(owner, name), path
-        setattr(owner, name, value)
+    config.pipeline.model.semantic_field = SemanticFieldConfig(code_dim=3)
+    apply_changes(config, {path.replace("__", "."): value for path, value in changes.items()})
     torch.manual_seed(config.machine.seed)
     config.set_timestamp()
     config.save_config()

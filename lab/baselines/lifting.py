@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from lang3dxl_ns.components.feature_decoder import Decoder, Features, Gathered
+from lang3dxl_ns.components.feature_decoder import Decoder, Features, Gathered, LearningDecoder
 
 _LEAST_COVERAGE = 1e-4
 
@@ -19,7 +19,7 @@ def split(decoder: Decoder, features: Float[Tensor, "*batch out"]) -> Features:
     return features[..., : decoder.clip_dim], dense
 
 
-class LiftedFeatures(Decoder):
+class LiftedFeatures(LearningDecoder):
     """Decoder of features that are averaged onto the Gaussians after training, by contribution.
 
     Gaussians then also carry a 1, whose rendering is the coverage. So a map is the mean feature of the

@@ -29,12 +29,12 @@ def cases(quick: bool, device: str) -> Iterator[Case]:
     presets = ("short", "paper") if quick else ("short", "paper", "official")
     for preset in presets:
         note = "rounding may choose the next cell, whose slope differs" if preset != "short" else ""
-        config = SemanticFieldConfig(preset=preset, log2_table_size=12, code_std=None)  # type: ignore[arg-type]
+        config = SemanticFieldConfig(preset=preset, log2_table_size=12)  # type: ignore[arg-type]
         # Unbounded codes reach eight times as far as a sigmoid's coordinates, so rounding grows as much.
         bounds = CROSSING if preset == "official" else FINE
         yield Case("decoder", f"preset {preset}", partial(_problem, _codes, config), bounds, note)
     # This shows that crossing into another cell is the cause: with exact coordinates there is no error.
-    exact = SemanticFieldConfig(preset="official", log2_table_size=12, code_std=None)
+    exact = SemanticFieldConfig(preset="official", log2_table_size=12)
     held = "codes are multiples of 1/64: their coordinates are exact in float32"
     yield Case("decoder", "preset official, no crossing", partial(_problem, _held_codes, exact), HELD, held)
     short = SemanticFieldConfig(preset="short")

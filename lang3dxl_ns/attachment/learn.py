@@ -15,7 +15,7 @@ from lang3dxl_ns.attachment.known_frames import Similarity
 from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.image import resize_nearest
 from lang3dxl_ns.components.decoders import DecoderConfig, make_decoder
-from lang3dxl_ns.components.feature_decoder import Decoder
+from lang3dxl_ns.components.feature_decoder import Decoder, LearningDecoder
 from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
 from lang3dxl_ns.preparation.encoders import CLIP_OPTION, find_model, usual_dense
 from lang3dxl_ns.preparation.foreground import with_foreground
@@ -61,8 +61,8 @@ def learn(
 ) -> tuple[Decoder, Float[Tensor, "n code"]]:
     """Learn a decoder and the Gaussians' codes, which are NaN for Gaussians that no photo shows, on the
     splat's device. `cameras` holds the photos' cameras in the splat's frame."""
-    field = SemanticFieldConfig(preset="short")
-    decoder = make_decoder(DecoderConfig(), field, targets.clip_dim, 0)
+    decoder = make_decoder(DecoderConfig(), SemanticFieldConfig("short"), targets.clip_dim, 0)
+    assert isinstance(decoder, LearningDecoder)
     decoder = decoder.to(splats.means.device)
     names = [photo.name for photo in collection.photos]
     dense = partial(targets.dense_features, names) if targets.dense_dim else None

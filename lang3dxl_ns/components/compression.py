@@ -19,7 +19,7 @@ from torch import Tensor, nn
 
 from lang3dxl_ns.common.device import to_device
 from lang3dxl_ns.components.code_search import nearest, settle
-from lang3dxl_ns.components.feature_decoder import Gathered
+from lang3dxl_ns.components.feature_decoder import Gathered, LearningDecoder
 from lang3dxl_ns.components.hash_grid import MOST_DIMENSIONS
 from lang3dxl_ns.components.principal_basis import PrincipalBasis
 from lang3dxl_ns.components.semantic_field import SemanticField, SemanticFieldConfig
@@ -223,7 +223,7 @@ def _principal_codes(
     return (places / deviation.clamp_min(1e-12)).clamp(-_REACH, _REACH)
 
 
-class _LearningField(SemanticField):
+class _LearningField(SemanticField, LearningDecoder):
     """Semantic field that can learn codes of features gathered onto Gaussians."""
 
     gathered_channels = 128

@@ -64,8 +64,6 @@ class Decoder(nn.Module, ABC):
     """Whether carried values are decoded per Gaussian before compositing, or per pixel after it."""
     needs_lifting = False
     """Whether the codes are computed from the photos after training instead of learned."""
-    gathered_channels: int | None = None
-    """Number of principal components to gather if CLIP features are wider; None gathers the features."""
 
     def initial_codes(self, count: int) -> Float[Tensor, "count code"] | None:
         """Return initial codes, one per Gaussian; None if Gaussians learn none."""
@@ -90,23 +88,6 @@ class Decoder(nn.Module, ABC):
     def clip_head(self) -> tuple[Float[Tensor, "clip r"], Float[Tensor, " clip"]] | None:
         """Return weight and bias of `decode_clip`'s linear last layer; None if `hidden` is the feature."""
         return None
-
-    def learn_gaussians(
-        self, gathered: Gathered, advance: Callable[[], None] = lambda: None
-    ) -> Float[Tensor, "n code"]:
-        """Learn codes for features gathered onto the Gaussians, and call `advance` `learning_steps` times."""
-        raise NotImplementedError(f"{type(self).__name__} does not learn from gathered features")
-
-    def learning_steps(self, count: int) -> int:
-        """Return the number of steps of `learn_gaussians` for `count` Gaussians."""
-        return 0
-
-    learned: str | None = None
-    """Result of `learn_gaussians` in a sentence, for the log; None if there is nothing to report."""
-
-    def learning_seconds(self, count: int) -> float:
-        """Estimate the seconds that `learn_gaussians` takes for `count` Gaussians on one core."""
-        return 0.0
 
     def picture(self, carried: Float[Tensor, "*batch d"]) -> Float[Tensor, "*batch 3"]:
         """Convert the first three channels to colors in [0, 1]."""
@@ -142,3 +123,26 @@ class Decoder(nn.Module, ABC):
             raise ValueError("output statistics must be finite and the deviations not negative")
         self.output_mean.copy_(mean)
         self.output_std.copy_(std)
+
+
+class LearningDecoder(Decoder):
+    """Interface of decoders that learn codes of finished Gaussians, from features gathered onto them."""
+
+    gathered_channels: int | None = None
+    """Number of principal components to gather if CLIP features are wider; None gathers the features."""
+    learned: str | None = None
+    """Result of `learn_gaussians` in a sentence, for the log; None if there is nothing to report."""
+
+    @abstractmethod
+    def learn_gaussians(
+        self, gathered: Gathered, advance: Callable[[], None] = lambda: None
+    ) -> Float[Tensor, "n code"]:
+        """Learn codes for features gathered onto the Gaussians, and call `advance` `learning_steps` times."""
+
+    def learning_steps(self, count: int) -> int:
+        """Return the number of steps of `learn_gaussians` for `count` Gaussians."""
+        return 0
+
+    def learning_seconds(self, count: int) -> float:
+        """Estimate the seconds that `learn_gaussians` takes for `count` Gaussians on one core."""
+        return 0.0

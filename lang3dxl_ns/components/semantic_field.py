@@ -5,9 +5,11 @@ feature value, not by position, and repeated structures share codes (Lang3D-XL).
 into CLIP features and, through the same hidden layers, dense (DINO) features.
 """
 
+from __future__ import annotations
+
 import math
-from dataclasses import dataclass, fields, replace
-from typing import Literal
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 import torch
 import torch.nn.functional as F
@@ -23,46 +25,16 @@ from lang3dxl_ns.components.linear import linear
 Preset = Literal["short", "paper", "official"]
 
 
-@dataclass(frozen=True)
-class FieldSettings:
-    """Resolved settings of a semantic field (see `SemanticFieldConfig`); defaults are preset `paper`."""
-
-    # Values as printed. The index coordinate is kept, not folded into a wider row, so the table has the
-    # printed size. Values that the paper does not give (range, initial codes, features per level) are safe
-    # choices.
-    code_dim: int = 3
-    code_std: float = 0.01
-    bounding: Literal["sigmoid", "raw"] = "sigmoid"
-    fourier_frequencies: int = 0
-    indexed: bool = True
-    levels: int = 16
-    features_per_level: int = 8
-    log2_table_size: int = 8
-    min_resolution: int = 16
-    max_resolution: int = 2048
-    hidden_layers: int = 3
-    hidden_width: int = 512
-    activation: Literal["every", "last"] = "last"
-    whiten: bool = False
-
-
-_PAPER = FieldSettings()
-PRESETS: dict[Preset, FieldSettings] = {
-    # A hash grid alone needs thousands of steps; Fourier features and a small grid learn within hundreds.
-    "short": replace(
-        _PAPER, fourier_frequencies=4, indexed=False, levels=8, features_per_level=4, log2_table_size=12,
-        max_resolution=256, hidden_layers=1, hidden_width=64, activation="every", whiten=True,
-    ),
-    "paper": _PAPER,
-    # The values of the code that the authors released.
-    "official": replace(
-        _PAPER, code_std=0.0, bounding="raw", log2_table_size=19, hidden_layers=2, activation="every"
-    ),
-}  # fmt: skip
+_T = TypeVar("_T")
+_UNSET: Any = None
+if TYPE_CHECKING:  # only settings that `resolved` has completed are read, and those have every value
+    _OrPreset = Annotated[_T, None]
+else:
+    _OrPreset = _T | None
 
 
 @showing("preset", "code_dim")
-@dataclass
+@dataclass(frozen=True)
 class SemanticFieldConfig:
     """Settings of a semantic field: a preset, and values that override it."""
 
@@ -70,51 +42,51 @@ class SemanticFieldConfig:
     """Values of all unset options. `short`: for hundreds to a few thousand steps, and for codes that are
     learned after training. `paper`: as printed. `official`: as released by the authors. `auto`: `short` for
     those, in runs of under 5,000 iterations, and where the length is unknown; otherwise `paper`."""
-    code_dim: int | None = None
+    code_dim: _OrPreset[int] = _UNSET
     """Channels of the rendered code, 2 to 6 (2 to 5 with `indexed`). Each doubles the cost of a lookup."""
-    code_std: float | None = None
+    code_std: _OrPreset[float] = _UNSET
     """Standard deviation of the initial codes. Presets keep it small, because a wide start scatters equal
     surfaces over the field."""
-    bounding: Literal["sigmoid", "raw"] | None = None
+    bounding: _OrPreset[Literal["sigmoid", "raw"]] = _UNSET
     """How a code becomes a coordinate. `sigmoid`: it is mapped into (0, 1), where distinct cells have
     distinct vertices. `raw`: it is unchanged, and codes outside [0, 1] share entries with those inside."""
-    fourier_frequencies: int | None = None
+    fourier_frequencies: _OrPreset[int] = _UNSET
     """Octaves of sines and cosines of the coordinate, as inputs beside the grid's features; 0 for none. The
     longest has one wave per unit."""
-    indexed: bool | None = None
+    indexed: _OrPreset[bool] = _UNSET
     """Prepend an index coordinate to the code and look up at index 0, 1/k, 2/k, … until there are as many
     channels as CLIP has (Lang3D-XL). Otherwise the grid is read once."""
-    levels: int | None = None
+    levels: _OrPreset[int] = _UNSET
     """Number of levels of the hash grid; 0 for Fourier features only."""
-    features_per_level: int | None = None
+    features_per_level: _OrPreset[int] = _UNSET
     """Number of features per level of the hash grid."""
-    log2_table_size: int | None = None
+    log2_table_size: _OrPreset[int] = _UNSET
     """Log2 of the maximum number of entries per level."""
-    min_resolution: int | None = None
+    min_resolution: _OrPreset[int] = _UNSET
     """Vertices per axis of the coarsest level."""
-    max_resolution: int | None = None
+    max_resolution: _OrPreset[int] = _UNSET
     """Vertices per axis of the finest level. Presets keep it low, because Adam with epsilon 1e-15 moves every
     touched entry equally far: fine levels would grow as large as coarse ones, and neighboring codes would
     decode to unrelated features."""
-    hidden_layers: int | None = None
+    hidden_layers: _OrPreset[int] = _UNSET
     """Number of hidden linear layers of the decoder."""
-    hidden_width: int | None = None
+    hidden_width: _OrPreset[int] = _UNSET
     """Number of channels of a hidden layer."""
-    activation: Literal["every", "last"] | None = None
+    activation: _OrPreset[Literal["every", "last"]] = _UNSET
     """Whether a ReLU follows `every` hidden layer, or only the `last` (as printed in the paper)."""
-    whiten: bool | None = None
+    whiten: _OrPreset[bool] = _UNSET
     """Output mean + deviation × network, with the targets' statistics, so that training starts at their mean.
     Otherwise the network's output is used as it is."""
 
-    def resolved(self) -> FieldSettings:
+    def resolved(self) -> SemanticFieldConfig:
         """Return all settings, with unset ones taken from the preset. Raises UserError if the preset is
         unknown, the code has too many or too few channels for the grid, or the decoder has no hidden layer or
         no input."""
         name = "short" if self.preset == "auto" else self.preset
         if name not in PRESETS:
             raise UserError(f"unknown field preset {name!r}: choose one of auto, {', '.join(PRESETS)}")
-        given = {field.name: getattr(self, field.name) for field in fields(FieldSettings)}
-        settings = replace(PRESETS[name], **{k: v for k, v in given.items() if v is not None})
+        given = {key: value for key, value in vars(self).items() if value is not None}
+        settings = replace(PRESETS[name], **given | {"preset": name})
         if settings.hidden_layers < 1:
             raise UserError(f"hidden_layers is {settings.hidden_layers}: the decoder needs at least one")
         if settings.min_resolution > settings.max_resolution:
@@ -130,6 +102,31 @@ class SemanticFieldConfig:
                 f"{' beside the index coordinate' if settings.indexed else ''}: choose code_dim in that range"
             )
         return settings
+
+
+_PAPER = SemanticFieldConfig(
+    # Values as printed. The index coordinate is kept, not folded into a wider row, so the table has the
+    # printed size. Values that the paper does not give (range, initial codes, features per level) are safe
+    # choices.
+    "paper", code_dim=3, code_std=0.01, bounding="sigmoid", fourier_frequencies=0, indexed=True, levels=16,
+    features_per_level=8, log2_table_size=8, min_resolution=16, max_resolution=2048, hidden_layers=3,
+    hidden_width=512, activation="last", whiten=False,
+)  # fmt: skip
+PRESETS: dict[Preset, SemanticFieldConfig] = {
+    # A hash grid alone needs thousands of steps; Fourier features and a small grid learn within hundreds.
+    "short": replace(
+        _PAPER, preset="short", fourier_frequencies=4, indexed=False, levels=8, features_per_level=4,
+        log2_table_size=12, max_resolution=256, hidden_layers=1, hidden_width=64, activation="every",
+        whiten=True,
+    ),
+    "paper": _PAPER,
+    # The values of the code that the authors released.
+    "official": replace(
+        _PAPER, preset="official", code_std=0.0, bounding="raw", log2_table_size=19, hidden_layers=2,
+        activation="every",
+    ),
+}  # fmt: skip
+"""Complete settings of each preset."""
 
 
 class SemanticField(Decoder):
@@ -230,7 +227,9 @@ class SemanticField(Decoder):
         return weight, self.output.bias[channels] * std + self.output_mean[channels]
 
 
-def _hidden_layers(inputs: int, settings: FieldSettings, generator: torch.Generator | None) -> nn.Sequential:
+def _hidden_layers(
+    inputs: int, settings: SemanticFieldConfig, generator: torch.Generator | None
+) -> nn.Sequential:
     layers: list[nn.Module] = []
     for depth in range(settings.hidden_layers):
         layers.append(

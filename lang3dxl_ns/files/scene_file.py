@@ -95,46 +95,24 @@ def write_scene(path: Path, scene: Scene, provenance: Provenance | None = None) 
     check_scene_name(path)
     from safetensors.numpy import save
 
-    splats = scene.splats
-    content = {
-        "means": _array(splats.means, np.float32),
-        "quats": _array(F.normalize(splats.quats, dim=1), np.float16),
-        "log_scales": _array(log_scales(splats), np.float16),
-        "logits": _array(logits(splats), np.float16),
-        "harmonics": _array(splats.harmonics.clamp(-_LARGEST_HALF, _LARGEST_HALF), np.float16),
-    }
+    content = _stored_splats(scene.splats)
     described: dict[str, Any] = {
         "version": VERSION,
-        "antialiased": splats.antialiased,
+        "antialiased": scene.splats.antialiased,
         "background": None if scene.background is None else scene.background.tolist(),
         "provenance": asdict(provenance or Provenance()),
         "taught": [word.to_json() for word in scene.words.values()],
     }
     if scene.decoder is not None and scene.codes is not None:
-        settings = getattr(getattr(scene.decoder, "field", scene.decoder), "settings", None)
-        described["decoder"] = {
-            "name": scene.decoder.name,
-            "clip_dim": scene.decoder.clip_dim,
-            "dense_dim": scene.decoder.dense_dim,
-            "settings": None if settings is None else asdict(settings),
-        }
-        described["words"] = list(common_words())
+        words = list(common_words())
+        described |= {"decoder": _described_decoder(scene.decoder), "words": words}
         content |= _stored_state("decoder", scene.decoder)
-        content["codes"] = _array(scene.codes, np.float32)
-        if scene.decoder.bounded:  # 16-bit coordinates in (0, 1), which the hash grid reads
-            places = 1 + (scene.codes.double().sigmoid() * _STEPS).round()
-            known = scene.codes.isfinite().all(1, keepdim=True)
-            content["codes"] = _array(torch.where(known, places, 0), np.uint16)
-        content["words"] = _array(scene.text.vectors(described["words"]), np.float16)
+        content["codes"] = _stored_codes(scene.codes, scene.decoder.bounded)
+        content["words"] = _array(scene.text.vectors(words), np.float16)
     if scene.looks is not None:
-        field = scene.looks
-        described["looks"] = {"config": asdict(field.config), "names": field.names}
-        content |= _stored_state("looks", field)
-    for i, photo in enumerate(scene.photos):
-        camera, picture = resized(photo.camera, _MASK_SIDE), io.BytesIO()
-        if (mask := photo.foreground((camera.height, camera.width))) is not None:
-            Image.fromarray(mask.cpu().numpy()).save(picture, "PNG", optimize=True)
-            content[f"mask.{i}"] = np.frombuffer(picture.getvalue(), np.uint8)
+        described["looks"] = {"config": asdict(scene.looks.config), "names": scene.looks.names}
+        content |= _stored_state("looks", scene.looks)
+    content |= _stored_masks(scene)
     photos = [replace(photo, mask=None) for photo in scene.photos]
     described["scene"] = asdict(replace(scene.file, photos=photos, data=Path(scene.file.data).name))
     data = save(content, {_KEY: json.dumps(described, separators=(",", ":"))})
@@ -142,6 +120,44 @@ def write_scene(path: Path, scene: Scene, provenance: Provenance | None = None) 
         data = _carried(path.suffix, scene, data)
     write_atomically(path, data)
     return len(data)
+
+
+def _stored_splats(splats: Splats) -> dict[str, Array]:
+    return {
+        "means": _array(splats.means, np.float32),
+        "quats": _array(F.normalize(splats.quats, dim=1), np.float16),
+        "log_scales": _array(log_scales(splats), np.float16),
+        "logits": _array(logits(splats), np.float16),
+        "harmonics": _array(splats.harmonics.clamp(-_LARGEST_HALF, _LARGEST_HALF), np.float16),
+    }
+
+
+def _described_decoder(decoder: Decoder) -> dict[str, Any]:
+    settings = getattr(getattr(decoder, "field", decoder), "settings", None)
+    values = {} if settings is None else asdict(settings)
+    values.pop("preset", None)  # all of its values are there
+    described = {"name": decoder.name, "clip_dim": decoder.clip_dim, "dense_dim": decoder.dense_dim}
+    return described | {"settings": values or None}
+
+
+def _stored_codes(codes: Float[Tensor, "n d"], bounded: bool) -> Array:
+    """Encode codes as they are, or bounded ones as 16-bit coordinates in (0, 1), which the hash grid reads,
+    with 0 for Gaussians without one."""
+    if not bounded:
+        return _array(codes, np.float32)
+    places = 1 + (codes.double().sigmoid() * _STEPS).round()
+    return _array(torch.where(codes.isfinite().all(1, keepdim=True), places, 0), np.uint16)
+
+
+def _stored_masks(scene: Scene) -> dict[str, Array]:
+    """Encode the photos' foreground masks as PNG, at a size that suffices for queries."""
+    stored = {}
+    for i, photo in enumerate(scene.photos):
+        camera, picture = resized(photo.camera, _MASK_SIDE), io.BytesIO()
+        if (mask := photo.foreground((camera.height, camera.width))) is not None:
+            Image.fromarray(mask.cpu().numpy()).save(picture, "PNG", optimize=True)
+            stored[f"mask.{i}"] = np.frombuffer(picture.getvalue(), np.uint8)
+    return stored
 
 
 def _carried(kind: str, scene: Scene, record: bytes) -> bytes:

@@ -96,7 +96,7 @@ def _differences(settings: Any, complete: bool, place: str = "") -> Iterator[str
     for name, field in sorted(known.items()):
         default = field.default if field.default_factory is MISSING else field.default_factory()
         if name not in own:
-            setattr(settings, name, default)
+            vars(settings)[name] = default  # settings may be frozen
         value = getattr(settings, name)
         if name == "_target" and value is not default:
             yield f"would start {place}{name} {value!r}"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -166,9 +166,10 @@ class Lang3DXLTrainerConfig(RunConfig):
             self.pipeline.datamanager.clip = earlier.datamanager.clip
         earlier = earlier.model
         needs, mine = read_needs(run), self.pipeline.model
-        for part in ("semantic_field", "appearance"):
-            if getattr(mine, part).preset == "auto":
-                getattr(mine, part).preset = getattr(earlier, part).preset
+        if mine.semantic_field.preset == "auto":
+            mine.semantic_field = replace(mine.semantic_field, preset=earlier.semantic_field.preset)
+        if mine.appearance.preset == "auto":
+            mine.appearance.preset = earlier.appearance.preset
 
         def settle(owner: Any, before: Any, name: str, component: str) -> None:
             choice = getattr(before, name)

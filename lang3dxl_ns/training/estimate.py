@@ -13,6 +13,7 @@ from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.reports import synchronize
 from lang3dxl_ns.common.stages import roughly
 from lang3dxl_ns.components.appearance import render_in_look
+from lang3dxl_ns.components.feature_decoder import LearningDecoder
 from lang3dxl_ns.rendering import gsplat_build
 from lang3dxl_ns.rendering.rasterize import Backend
 from lang3dxl_ns.training.state import PhotoCamera, Training
@@ -43,9 +44,9 @@ def estimate(run: Training, cameras: Sequence[PhotoCamera], steps: int) -> tuple
     rendering, words = median(times), 0.0
     seconds = rendering * steps * RENDERINGS_PER_STEP[run.learns_from_renderings]
     line = f"training: {roughly(seconds)} for {steps:,} iterations"
-    if (semantics := run.parts.semantics) is not None and semantics.decoder.needs_lifting:
-        words = rendering * len(cameras) * RENDERINGS_PER_PHOTO
-        words += semantics.decoder.learning_seconds(len(run.means))
+    decoder = None if run.parts.semantics is None else run.parts.semantics.decoder
+    if isinstance(decoder, LearningDecoder) and decoder.needs_lifting:
+        words = rendering * len(cameras) * RENDERINGS_PER_PHOTO + decoder.learning_seconds(len(run.means))
         line += f", then {roughly(words)} to learn words"
     return f"{line}, more if Gaussians multiply", words / seconds if seconds else 1.0
 

@@ -13,7 +13,7 @@ from torch.nn import Parameter
 
 from lang3dxl_ns.common.console import progress, say, tracked
 from lang3dxl_ns.common.device import in_full_precision
-from lang3dxl_ns.components.feature_decoder import Decoder, Gathered
+from lang3dxl_ns.components.feature_decoder import Gathered, LearningDecoder
 from lang3dxl_ns.components.principal_basis import PrincipalBasis
 from lang3dxl_ns.preparation.targets import Batch, foreground
 from lang3dxl_ns.rendering import composite
@@ -60,6 +60,7 @@ def learn_words(run: Training, data: TrainingData) -> None:
     """Give a run's Gaussians codes that represent the targets of its photos; see `learn_codes`."""
     semantics, facts = run.parts.semantics, run.facts
     assert semantics is not None and facts.clip_targets is not None
+    assert isinstance(semantics.decoder, LearningDecoder)
     views = (_target_view(run, *photo) for photo in data.every_photo())
     means = run.gaussians["means"].detach()
     # Initial codes are fitted to the unsharpened targets, which the loss compares with.
@@ -92,7 +93,7 @@ def _target_view(run: Training, view: PhotoCamera, batch: Batch) -> TargetView:
 # A training step's autocast would keep 16-bit copies of the first weights through all steps of the fit.
 @in_full_precision
 def learn_codes(
-    decoder: Decoder,
+    decoder: LearningDecoder,
     views: Iterable[TargetView],
     count: int,
     means: Float[Tensor, "n 3"],
@@ -105,7 +106,7 @@ def learn_codes(
     Codes of Gaussians that no photo shows are NaN.
 
     Args:
-        decoder: a decoder with `learn_gaussians`, which is trained in place.
+        decoder: the decoder, which is trained in place.
         views: the photos, each once.
         count: number of the photos.
         means: centers of the Gaussians, which determine number, type and device of the codes.

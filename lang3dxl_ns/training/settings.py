@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from operator import attrgetter
 from typing import Literal
 
@@ -13,7 +13,8 @@ from lang3dxl_ns.common.options import model_option
 from lang3dxl_ns.components.appearance import AppearanceConfig
 from lang3dxl_ns.components.decoders import DecoderConfig
 from lang3dxl_ns.components.downsampler import DownsamplerConfig
-from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
+from lang3dxl_ns.components.feature_decoder import LearningDecoder
+from lang3dxl_ns.components.semantic_field import Preset, SemanticFieldConfig
 from lang3dxl_ns.preparation.settings import PreparationConfig
 from lang3dxl_ns.training.learning_rates import EXTENT, log_linear, run_length_weight
 from lang3dxl_ns.training.scene_settings import SceneSettings
@@ -99,15 +100,21 @@ class TrainingSettings(SceneSettings):
         if self.semantic_field.preset == "auto":
             # Compression is a direct regression and does not depend on the run's length.
             compressed = self.decoder.name == "gathered"
-            preset = "short" if compressed or iterations < SHORT_FIELD_RUN else "paper"
-            self.semantic_field.preset = preset  # type: ignore[assignment]
+            preset: Preset = "short" if compressed or iterations < SHORT_FIELD_RUN else "paper"
+            self.semantic_field = replace(self.semantic_field, preset=preset)
             if self.decoder.name == "paper":
                 say(
                     f"Semantic field: preset {preset} (short in runs of under {SHORT_FIELD_RUN:,} "
                     "iterations, paper, as printed, in longer ones)"
                 )
+        learns = issubclass(self.decoder.kind, LearningDecoder)
         if self.codes_from == "auto":
-            self.codes_from = "photos" if iterations < SHORT_FIELD_RUN else "noise"
+            self.codes_from = "photos" if learns and iterations < SHORT_FIELD_RUN else "noise"
+        if self.codes_from == "photos" and not learns:
+            raise UserError(
+                f"codes of the decoder {self.decoder.name} can't start from photos: leave "
+                f"{model_option('codes-from')} off"
+            )
         if self.codes_from == "photos" and not self.warm_up:
             self.warm_up = START_OF_CODES
         if self.appearance.preset == "auto":

@@ -2,15 +2,16 @@
 
 import math
 from copy import deepcopy
-from operator import attrgetter
 from pathlib import Path
 
 import pytest
 import torch
 
+from lab.benchmarks.scored_runs import apply_changes
 from lab.run_config import run_config
 from lang3dxl_ns.cli import main
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
 from lang3dxl_ns.methods import METHODS, lang3dxl
 from lang3dxl_ns.plugin.trainer import requested_checkpoint
 from lang3dxl_ns.preparation.settings import PreparationConfig
@@ -66,16 +67,16 @@ SETTINGS = [
 def test_settings(path, value, tmp_path):
     config = deepcopy(METHODS["lang3dxl-paper"].config)
     config.output_dir = tmp_path / "outputs"
-    owner, _, name = path.rpartition(".")
-    setattr(attrgetter(owner)(config) if owner else config, name, value)
-    with pytest.raises(UserError, match=f"{name.replace('_', '[-_]')} is "):
+    apply_changes(config, {path: value})
+    name = path.rpartition(".")[2].replace("_", "[-_]")
+    with pytest.raises(UserError, match=f"{name} is "):
         config.set_timestamp()
     assert not config.output_dir.exists()
 
 
 def test_a_resolution_above_another_and_a_learning_rate_below_zero(tmp_path):
     config = deepcopy(lang3dxl.config)
-    config.pipeline.model.semantic_field.min_resolution = 5_000
+    config.pipeline.model.semantic_field = SemanticFieldConfig(min_resolution=5_000)
     with pytest.raises(UserError, match="min_resolution 5000 is above"):
         config.set_timestamp()
     config = deepcopy(lang3dxl.config)

@@ -11,6 +11,7 @@ import torch
 from lab.landmark import scene_writer
 from lab.landmark.demo import Demo
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
 from lang3dxl_ns.training.checkpoint import CHECKPOINT
 from lang3dxl_ns.training.fit import Run
 
@@ -26,7 +27,8 @@ def few_steps_of_words():
 
     def fewer(self, out):
         found = settings(self, out)
-        found.scene.decoder.compression.steps, found.scene.semantic_field.code_dim = 40, 3
+        found.scene.decoder.compression.steps = 40
+        found.scene.semantic_field = SemanticFieldConfig(code_dim=3)
         return found
 
     with pytest.MonkeyPatch.context() as patch:

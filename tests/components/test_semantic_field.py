@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.components.semantic_field import PRESETS, FieldSettings, SemanticField, SemanticFieldConfig
+from lang3dxl_ns.components.semantic_field import PRESETS, SemanticField, SemanticFieldConfig
 
 # Every preset, at a size affordable in a test.
 CONFIGS = {
@@ -239,9 +239,11 @@ def test_a_setting_wins_over_its_preset():
     )
 
 
-def test_the_config_has_every_setting():
-    names = {field.name for field in dataclasses.fields(SemanticFieldConfig)}
-    assert names == {field.name for field in dataclasses.fields(FieldSettings)} | {"preset"}
+@pytest.mark.parametrize("name", ["auto", *PRESETS])
+def test_resolved_settings_are_complete_and_resolve_to_themselves(name):
+    settings = SemanticFieldConfig(name).resolved()
+    assert None not in dataclasses.astuple(settings)
+    assert settings.resolved() == settings
 
 
 def test_wrong_settings_are_explained():

@@ -5,6 +5,7 @@ from copy import deepcopy
 import pytest
 import tyro
 
+from lab.benchmarks.scored_runs import apply_changes
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.components.downsampler import DownsamplerConfig
 from lang3dxl_ns.methods import lang3dxl
@@ -13,12 +14,7 @@ from lang3dxl_ns.plugin.inert_settings import OF_COLMAP, OF_IMAGE_CACHES, OF_SPL
 
 def changed(path, value):
     config = deepcopy(lang3dxl.config)
-    *owners, name = path.split(".")
-    owner = config
-    for part in owners:
-        owner = getattr(owner, part)
-    assert hasattr(owner, name)
-    setattr(owner, name, value)
+    apply_changes(config, {path: value})
     return config
 
 

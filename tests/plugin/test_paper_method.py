@@ -99,6 +99,16 @@ def test_codes_start_crops_and_looks_are_as_printed_in_runs_that_are_long_enough
     assert config.pipeline.datamanager.crops == crops
 
 
+def test_codes_start_from_photos_only_where_the_decoder_can_learn_them():
+    config = deepcopy(lang3dxl_paper.config)
+    config.max_num_iterations, config.pipeline.model.decoder.name = 600, "direct"
+    config.fit_to_run()
+    assert config.pipeline.model.codes_from == "noise"
+    config.pipeline.model.codes_from = "photos"
+    with pytest.raises(UserError, match="codes of the decoder direct can't start from photos"):
+        config.fit_to_run()
+
+
 @pytest.mark.parametrize(("iterations", "sides"), [(600, (56, 72)), (30_000, (80, 120))])
 def test_short_runs_decode_smaller_maps(iterations, sides):
     config = deepcopy(lang3dxl_paper.config)

@@ -10,6 +10,7 @@ import torch
 from scenes import write_scene
 
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
 from lang3dxl_ns.files.scene_file import read_scene
 from lang3dxl_ns.scene.capture import open_capture
 from lang3dxl_ns.training import fit as fitting
@@ -31,7 +32,7 @@ def settings(tiny_clip, tiny_dense):
     def make(steps: int = STEPS, **changes) -> Settings:
         made = Settings.of("lang3dxl", steps)
         made.targets.clip, made.targets.dense = str(tiny_clip), str(tiny_dense)
-        made.scene.sky_gaussians, made.scene.semantic_field.code_dim = 400, 3
+        made.scene.sky_gaussians, made.scene.semantic_field = 400, SemanticFieldConfig(code_dim=3)
         made.scene.decoder.compression.steps, made.scene.decoder.compression.batch = 20, 512
         for name, value in (GROWING | changes).items():
             assert hasattr(made.scene, name)
