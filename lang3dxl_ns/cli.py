@@ -53,7 +53,7 @@ COMMANDS = {
         "commands.things:ListThings",
         "List, count and ask for single things: windows, portals, towers.",
     ),
-    "export": ("commands.query:Export", "Write a scene, or what matches a text, as a splat or a web page."),
+    "export": ("commands.export:Export", "Write a scene, or what matches a text, as a splat or a web page."),
     "teach": ("commands.teach:Teach", "Show a scene what a word means, by marking it in a photo."),
     "words": ("commands.teach:Words", "List, forget, save and load the words that a scene was taught."),
     "info": ("commands.view:Info", "Tell what a scene file holds, and where it comes from."),

@@ -60,14 +60,8 @@ def attach(
         UserError: the splat or the photos cannot be read, or the photos do not show the splat.
     """
     config, place = config or AttachConfig(), None if out is None else expanded(out).absolute()
-    for word in config.segment:
-        taught_prompt(word)  # fail before the work
-    if place is not None:
-        check_scene_name(place)
-    elif data is None:
-        raise UserError("views of the splat are kept beside its scene: name the file to write (out)")
+    _check_request(config, data, place)
     path = find_splats(splat)
-    check_data(None if data is None else Path(data))
     if place is not None:
         make_folder(place.parent)
         if not os.access(place.parent, os.W_OK):
@@ -75,16 +69,7 @@ def attach(
     stages = Stages(_SHARES | {"segment": 0.3} if config.segment else _SHARES)
     worker = known_device(device)
     with stages.stage("splat"):  # a damaged one is refused before any model is downloaded
-        splats = read_splats(path).to(worker)
-        middle = splats.means.median(0).values
-        spread, far = float((splats.means - middle).norm(dim=1).median()), float(middle.norm())
-        if spread < max(_SMALLEST, _NEAREST * far):
-            raise UserError(
-                f"half of the Gaussians of {path} lie within {spread:.2g} units of one place, {far:,.0f} "
-                "units from the origin, too close to be seen or too far for 32-bit numbers: export the splat "
-                "again, larger, or without the offset of map coordinates"
-            )
-        say(f"{path}: {splats}")
+        splats = _read(path).to(worker)
     preparation = settled(config)
     check_encoders(preparation.clip, preparation.dense)
     found = find_text_segmenter(preparation.foreground_model, preparation.sam) if config.segment else None
@@ -99,17 +84,14 @@ def attach(
     with stages.stage("prepare"):
         cache = cache_folder(collection.folder, config.cache_dir)
         collection, targets = prepare_photos(collection, preparation, cache, worker)
-    tracked = collection.reconstruction.photos
-    cameras = {
-        photo.name: camera_in(similarity, tracked[photo.name].resized(photo.width, photo.height))
-        for photo in collection.photos
-    }
+    tracked, photos = collection.reconstruction.photos, collection.photos
+    cameras = {p.name: camera_in(similarity, tracked[p.name].resized(p.width, p.height)) for p in photos}
     with stages.stage("learn"):
         decoder, codes = learn(splats, collection, cameras, targets)
+    shown = f"{len(photos)} {'views' if data is None else 'photos'}"
     seen = float(codes.isfinite().all(1).float().mean())
-    what = "photos" if data is not None else "views"
-    where = " in their foreground" if any(photo.mask_path for photo in collection.photos) else ""
-    say(f"{len(collection.photos)} {what} show {seen:.0%} of the Gaussians{where}; the others match nothing")
+    where = " in their foreground" if any(photo.mask_path for photo in photos) else ""
+    say(f"{shown} show {seen:.0%} of the Gaussians{where}; the others match nothing")
     file = scene_file(collection, cameras, similarity, preparation)
     visible = None if place is None else place.with_name(f".{place.stem}.visible")
     scene = Scene(splats, file, decoder, codes, cache=visible)
@@ -117,15 +99,41 @@ def attach(
         with stages.stage("segment"):
             segmenter = load_text_segmenter(found, worker)
             for word in config.segment:
-                scene = segmented(scene, word, segmenter, collection.photos, cameras)
+                scene = segmented(scene, word, segmenter, photos, cameras)
     if place is not None:
-        made = f"attached to {path.name} from {len(collection.photos)} {what}"
-        scene, written = replace_scene(place, scene, Provenance(title=place.stem, made_how=made))
+        made = Provenance(title=place.stem, made_how=f"attached to {path.name} from {shown}")
+        scene, written = replace_scene(place, scene, made)
         say(f"Wrote {written / 1e6:.1f} MB to {place}")
-        if data is None:
-            kept = sum(file.stat().st_size for file in collection.folder.rglob("*") if file.is_file())
-            say(f"{collection.folder} keeps the views ({kept / 1e6:.0f} MB): delete it if you are done")
+    if data is None:
+        kept = sum(file.stat().st_size for file in collection.folder.rglob("*") if file.is_file())
+        say(f"{collection.folder} keeps the views ({kept / 1e6:.0f} MB): delete it if you are done")
     return scene
+
+
+def _check_request(config: AttachConfig, data: str | Path | None, place: Path | None) -> None:
+    """Raise UserError for a word that can't be taught, a name that is no scene's, and missing photos."""
+    for word in config.segment:
+        taught_prompt(word)
+    if place is not None:
+        check_scene_name(place)
+    elif data is None:
+        raise UserError("views of the splat are kept beside its scene: name the file to write (out)")
+    check_data(None if data is None else Path(data))
+
+
+def _read(path: Path) -> Splats:
+    """Read and report a splat. Raises UserError if it is damaged, or too small or far away to be drawn."""
+    splats = read_splats(path)
+    middle = splats.means.median(0).values
+    spread, far = float((splats.means - middle).norm(dim=1).median()), float(middle.norm())
+    if spread < max(_SMALLEST, _NEAREST * far):
+        raise UserError(
+            f"half of the Gaussians of {path} lie within {spread:.2g} units of one place, {far:,.0f} "
+            "units from the origin, too close to be seen or too far for 32-bit numbers: export the splat "
+            "again, larger, or without the offset of map coordinates"
+        )
+    say(f"{path}: {splats}")
+    return splats
 
 
 def _frame(splats: Splats, collection: Capture, path: Path, place: Path | None) -> Similarity:

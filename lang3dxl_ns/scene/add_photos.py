@@ -87,8 +87,49 @@ def add_photos(
     settings = settings or ReconstructionSettings()
     check_settings(settings)
     data, folder = expanded(data).absolute(), expanded(folder).absolute()
-    work = cache_folder(data, cache_dir).absolute() / REPORT.parent
+    cache = cache_folder(data, cache_dir).absolute()
+    work = cache / REPORT.parent
     place = find_model(data) or work / "sparse" / "0"
+    images, old = _photos_of(data, place)
+    targets = _targets(folder, images, set(old))
+    adding = work / "adding"
+    with locked(adding, busy=f"another command adds photos in {adding}: wait for it, or end it"), quiet():
+        good, left_out = usable(PhotoFolder(images, (*old, *targets)))
+        copies = numbered(good, adding)
+        database = feature_database(good, copies, adding, settings)
+        extract(database, copies, settings)
+        number = dict(zip(good.names, copies.names, strict=True))
+        match(database, copies.names, settings, {number[name] for name in targets if name in number})
+        model = load_pycolmap().Reconstruction(place)
+        with load_pycolmap().Database.open(database) as db:
+            ids = {name: db.read_image_with_name(number[name]).image_id for name in good.names}
+            scene = _Scene(model, db, {ids[name]: name for name in good.names}, good)
+            placed = scene.place_all([ids[name] for name in targets if name in ids])
+            doubtful = {targets[name]: why for name, why in scene.doubts(placed).items()}
+            numbers = {
+                i: _add(model, photo, targets[scene.names[i]], db.read_keypoints(i)[:, :2].astype(float))
+                for i, photo in placed.items()
+            }
+            _triangulate(model, db, numbers)
+    found = {scene.names[i] for i in placed}
+    lost = {targets[n]: left_out.get(n, "too few of its matches agree") for n in targets if n not in found}
+    told = reasons_in_words({"without a place": lost, "doubtfully placed": doubtful})
+    if not found:
+        raise UserError(f"none of the {len(targets)} new photos finds a place; {'; '.join(told)}")
+    _copy(images, {name: target for name, target in targets.items() if name in found})
+    for image in numbers.values():
+        model.extract_colors_for_image(image, images)  # only of points without a color
+    kept = _replace(place, model, work)
+    write_picture(model, doubtful | doubtful_photos(cache), work)
+    _report(work / REPORT.name, len(targets), len(found), doubtful)
+    say(f"{len(found)} of {len(targets)} new photos have a pose; the model as it was is in {kept}", *told)
+    say(picture_line(work))
+    return place
+
+
+def _photos_of(data: Path, place: Path) -> tuple[Path, list[str]]:
+    """Return the folder of a model's photos, and their names. Raises UserError if the model or its photos are
+    missing, or can't be written."""
     if not has_model(place):
         raise UserError(f"{data} has no COLMAP model to add to: reconstruct it first, without --add")
     images = images_folder(data, place)
@@ -98,44 +139,15 @@ def add_photos(
     for written in (images, place.parent):
         if not os.access(written, os.W_OK):
             raise UserError(f"{written} can't be written to: copy the scene to where it can")
-    targets = _targets(folder, images, set(old))
-    work = work / "adding"
-    with locked(work, busy=f"another command adds photos in {work}: wait for it, or end it"), quiet():
-        good, left_out = usable(PhotoFolder(images, (*old, *targets)))
-        copies = numbered(good, work)
-        database = feature_database(good, copies, work, settings)
-        extract(database, copies, settings)
-        number = dict(zip(good.names, copies.names, strict=True))
-        match(database, copies.names, settings, {number[name] for name in targets if name in number})
-        model = load_pycolmap().Reconstruction(place)
-        with load_pycolmap().Database.open(database) as db:
-            ids = {name: db.read_image_with_name(number[name]).image_id for name in good.names}
-            scene = _Scene(model, db, {ids[name]: name for name in good.names}, good)
-            placed = scene.place_all([ids[name] for name in targets if name in ids])
-            doubtful = scene.doubts(placed)
-            found = {scene.names[i]: (i, photo) for i, photo in placed.items()}
-            numbers = {
-                i: _add(model, photo, targets[name], db.read_keypoints(i)[:, :2].astype(float))
-                for name, (i, photo) in found.items()
-            }
-            _triangulate(model, db, numbers)
-    lost = {targets[n]: left_out.get(n, "too few of its matches agree") for n in targets if n not in found}
-    doubtful = {targets[name]: why for name, why in doubtful.items()}
-    told = reasons_in_words({"without a place": lost, "doubtfully placed": doubtful})
-    if not found:
-        raise UserError(f"none of the {len(targets)} new photos finds a place; {'; '.join(told)}")
-    for name in found:
-        if not (images / targets[name]).exists():
-            make_folder((images / targets[name]).parent)
-            shutil.copy2(images / name, images / targets[name])
-    for image in numbers.values():
-        model.extract_colors_for_image(image, images)  # only of points without a color
-    kept = _replace(place, model, work.parent)
-    write_picture(model, doubtful | doubtful_photos(work.parent.parent), work.parent)
-    _report(work.parent / REPORT.name, len(targets), len(found), doubtful)
-    say(f"{len(found)} of {len(targets)} new photos have a pose; the model as it was is in {kept}", *told)
-    say(picture_line(work.parent))
-    return place
+    return images, old
+
+
+def _copy(images: Path, targets: Mapping[str, str]) -> None:
+    """Copy new photos beside the scene's, unless they are there."""
+    for name, target in targets.items():
+        if not (images / target).exists():
+            make_folder((images / target).parent)
+            shutil.copy2(images / name, images / target)
 
 
 def _targets(folder: Path, images: Path, known: set[str]) -> dict[str, str]:

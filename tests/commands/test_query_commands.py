@@ -9,7 +9,7 @@ from painted_scene import COUNT, painted_gaussians, painted_scene
 from PIL import Image
 
 from lang3dxl_ns import cli
-from lang3dxl_ns.commands import query as commands
+from lang3dxl_ns.commands import export, query
 from lang3dxl_ns.commands.query import file_names
 from lang3dxl_ns.common.files import slugs
 
@@ -17,9 +17,10 @@ from lang3dxl_ns.common.files import slugs
 @pytest.fixture
 def run(monkeypatch):
     """Runs a command on the painted scene."""
-    monkeypatch.setattr(
-        commands, "load_scene", lambda path, settings=None, clip=None: painted_scene(config=settings)
-    )
+    for command in (query, export):
+        monkeypatch.setattr(
+            command, "load_scene", lambda path, settings=None, clip=None: painted_scene(config=settings)
+        )
     return lambda *words: cli.main([str(word) for word in words])
 
 

@@ -1,0 +1,76 @@
+"""Labels in COCO's format: the masks of texts in photos."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool
+from numpy import ndarray as Array
+from scipy.ndimage import find_objects, label
+
+from lang3dxl_ns.common.checks import expect
+from lang3dxl_ns.common.errors import UserError, readable
+from lang3dxl_ns.common.files import read_json, write_atomically
+from lang3dxl_ns.words.taught_words import run_lengths
+
+_LEAST_PART = 1e-4
+"""Share of a photo below which a separate part of a mask is no label."""
+
+
+def check_labels_file(path: Path) -> None:
+    """Raise UserError if labels can't be written to a path, or would replace a file of another kind."""
+    if path.suffix != ".json" or path.is_dir():
+        raise UserError(f"--coco writes labels as JSON: {path} is not the name of a .json file")
+    if path.is_file() and path.stat().st_size:
+        with readable(f"{path} is another file than one of labels", "choose another name"):
+            expect({"images", "annotations"} <= {*read_json(path, 1 << 31)}, "it has no annotations")
+
+
+class CocoLabels:
+    """A data set in COCO's format, with an annotation for each connected part of each mask."""
+
+    def __init__(self, categories: Sequence[str]) -> None:
+        self.content: dict[str, Any] = {
+            "info": {"description": "Matches in a scene of lang3dxl-ns, drawn on the undistorted photos"},
+            "images": [],
+            "annotations": [],
+            "categories": [{"id": i, "name": name} for i, name in enumerate(categories, start=1)],
+        }
+        """Content of the COCO file."""
+
+    def add(self, photo: str, masks: Sequence[Bool[Array, "h w"]]) -> None:
+        """Add a photo by name, with one mask per category, at the size of the photo's file."""
+        images, annotations = self.content["images"], self.content["annotations"]
+        height, width = masks[0].shape
+        images.append({"id": len(images) + 1, "file_name": photo, "width": width, "height": height})
+        for category, mask in enumerate(masks, start=1):
+            numbers, _ = label(mask)
+            for number, place in enumerate(find_objects(numbers), start=1):
+                part = numbers[place] == number
+                area = int(np.count_nonzero(part))
+                if area < _LEAST_PART * mask.size:
+                    continue
+                rows, columns = place
+                box = [columns.start, rows.start, columns.stop - columns.start, rows.stop - rows.start]
+                outline = {"size": [height, width], "counts": _runs(part, place, mask.shape)}
+                labeled = {"id": len(annotations) + 1, "image_id": len(images), "category_id": category}
+                found = {"segmentation": outline, "area": area, "bbox": box, "iscrowd": 0}
+                annotations.append({**labeled, **found})
+
+    def write(self, path: Path) -> None:
+        """Write the COCO file, atomically."""
+        write_atomically(path, json.dumps(self.content) + "\n")
+
+
+def _runs(part: Bool[Array, "r c"], place: tuple[slice, slice], size: tuple[int, ...]) -> list[int]:
+    """Return the `run_lengths` of a mask of this size with one part at a place, from its columns alone."""
+    (rows, columns), (height, width) = place, size
+    runs = run_lengths(np.pad(part, ((rows.start, height - rows.stop), (0, 0))))
+    runs[0] += height * columns.start
+    runs += [0] * (len(runs) % 2 == 0)
+    runs[-1] += height * (width - columns.stop)
+    return runs if runs[-1] else runs[:-1]

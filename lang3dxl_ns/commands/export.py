@@ -1,0 +1,154 @@
+"""`lang3dxl export`: a scene, or what matches a text, in another form."""
+
+from __future__ import annotations
+
+import shlex
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from lang3dxl_ns.commands.query import Negatives, parse_texts
+from lang3dxl_ns.common.console import say
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.files import make_folder, read_names
+from lang3dxl_ns.common.settings_help import showing
+from lang3dxl_ns.files.scene_file import Provenance, check_scene_name, replace_scene
+from lang3dxl_ns.files.splat_file import check_splat_name
+from lang3dxl_ns.open_scene import load_scene, provenance_of
+from lang3dxl_ns.query.question import QueryConfig
+from lang3dxl_ns.query.scene import Scene
+from lang3dxl_ns.query.text import Prompt
+from lang3dxl_ns.query.vocabulary import whole_words
+from lang3dxl_ns.web.video import RATE, tour_shots, write_video
+from lang3dxl_ns.web.write_page import Page, write_page
+
+_READ_BY: dict[str, tuple[str, ...]] = dict.fromkeys(("title", "credit", "license"), ("web", "scene_file"))
+_READ_BY |= dict.fromkeys(("text", "not_", "look"), ("out", "web"))
+_READ_BY |= {"vocabulary": ("web",), "photos": ("web",), "all": ("out",), "hide_floaters": ("out",)}
+"""Targets of `export` that read an option. Options that are not listed are read by every target."""
+
+
+@showing("scene", "text", "not_", "out", "web", "scene_file", "video", "title", "all", "look", "settings")
+@dataclass(kw_only=True)
+class Export:
+    """Write a scene in another form. --out writes a splat file of the Gaussians that match a text, in the
+    model's frame, which ordinary viewers open. --web writes a web page that answers words by itself.
+    --scene-file writes the scene itself to one file, which can be queried without its run and photos."""
+
+    scene: tyro.conf.Positional[Path | None] = None
+    """A .scene file, a folder that holds one, or a run (default: the newest run under outputs/)."""
+    text: tyro.conf.UseAppendAction[list[str]] = field(default_factory=list)
+    """Text to search for (default: write everything). With --web, prompts that the page opens with."""
+    not_: Negatives = field(default_factory=list)
+    """Negative for all texts. Repeat the flag for more."""
+    out: Path | None = None
+    """Splat file to write, .ply, .spz, .sog or .glb."""
+    web: Path | None = None
+    """Folder for a web page that any static server can serve."""
+    video: Path | None = None
+    """Video to write, such as out.mp4, of the tour that the page kept in the scene's file (needs ffmpeg)."""
+    vocabulary: Path | None = None
+    """File of more words that may name a place on the page, one per line."""
+    photos: Path | None = None
+    """Folder of the scene's photos, of which the page shows small copies (default: none are published)."""
+    scene_file: Path | None = None
+    """Scene file to write, NAME.scene, or NAME.glb or NAME.spz, which splat viewers show too."""
+    title: str = ""
+    """Title of page and scene (default: the scene's own, or the name of the photos' folder)."""
+    credit: str = ""
+    """Line about the photos: who took them."""
+    license: str = ""
+    """Terms under which photos and scene may be used."""
+    all: bool = False
+    """Write all Gaussians. With --text, a .ply has their relevancy as a property."""
+    hide_floaters: bool = False
+    """Leave out Gaussians that float where no surface is. A page opens with them hidden anyway."""
+    index: Path | None = None
+    """File (.npy or .txt) for the indices of the matching Gaussians, in the order of the scene, which is also
+    the order of the splat that it was attached to. It needs --text and --out."""
+    look: str | None = None
+    """Training photo whose lighting is used, by name (default: the photo that best shows the whole scene)."""
+    clip: str | None = None
+    """Name or folder of the scene's CLIP, if it is not where the scene file says."""
+    settings: Annotated[QueryConfig, tyro.conf.arg(name="")] = field(default_factory=QueryConfig)
+
+    def main(self) -> None:
+        target = self._target()
+        prompts = parse_texts(self.text, self.not_)
+        if self.scene_file is not None:
+            check_scene_name(self.scene_file)
+        if self.out is not None:
+            make_folder(self.out.parent)
+            check_splat_name(self.out)
+            if len(prompts) > 1:
+                raise UserError("a splat file is of one --text: write several files, or a page (--web)")
+        scene = load_scene(self.scene, settings=self.settings, clip=self.clip)
+        write = {"out": self._splat, "web": self._page, "scene_file": self._scene, "video": self._video}
+        write[target](scene, parse_texts(self.text, self.not_, scene.words))
+
+    def _target(self) -> str:
+        """Return which file is written. Raises UserError unless it is one, and for options without effect."""
+        targets = [n for n in ("out", "web", "scene_file", "video") if getattr(self, n) is not None]
+        if len(targets) != 1:
+            raise UserError("give one of --out FILE.ply, --web FOLDER, --scene-file NAME.scene, --video FILE")
+        if ignored := [n for n, by in _READ_BY.items() if getattr(self, n) and targets[0] not in by]:
+            option, target = (name.strip("_").replace("_", "-") for name in (ignored[0], targets[0]))
+            raise UserError(f"--{option} has no effect on --{target}: leave it off")
+        if self.not_ and not self.text:
+            raise UserError("--not is a negative of texts: give --text too, or leave it off")
+        if self.index is not None and (self.out is None or not self.text):
+            raise UserError("--index lists the Gaussians that match: give --text and --out with it")
+        if self.settings != QueryConfig() and not self.text and self.web is None:
+            raise UserError("settings of queries have no effect without --text: leave them off, or give one")
+        return targets[0]
+
+    def _splat(self, scene: Scene, prompts: list[Prompt]) -> None:
+        assert self.out is not None
+        count = scene.export(
+            self.out,
+            prompts[0] if prompts else None,
+            everything=self.all,
+            look=self.look,
+            index=self.index,
+            hide_floaters=self.hide_floaters,
+        )
+        say(f"Wrote {count} of {len(scene.splats)} Gaussians to {self.out}")
+
+    def _page(self, scene: Scene, prompts: list[Prompt]) -> None:
+        assert self.web is not None
+        own = read_names(self.vocabulary, "words") if self.vocabulary else ()
+        words = self._clip_words(scene.file.clip)
+        page = Page(scene, prompts, own, words, self._told(), self.look, self.photos)
+        size = write_page(page, self.web)
+        say(*(f"{left_out}." for left_out in page.left_out))
+        see = f"python -m http.server -d {shlex.quote(str(self.web))}"
+        say(f"Wrote {size / 1e6:.1f} MB to {self.web}; see it: {see}")
+
+    def _scene(self, scene: Scene, _: list[Prompt]) -> None:
+        assert self.scene_file is not None
+        _kept, size = replace_scene(self.scene_file, scene, self._told())
+        ask = f"lang3dxl query {shlex.quote(str(self.scene_file))}"
+        say(f"Wrote {size / 1e6:.1f} MB to {self.scene_file}; ask it: {ask}")
+
+    def _video(self, scene: Scene, _: list[Prompt]) -> None:
+        assert self.video is not None
+        count = write_video(self.video, scene, tour_shots(scene, self._told().tour))
+        say(f"Wrote {count} pictures, {count / RATE:.0f} seconds, to {self.video}")
+
+    def _clip_words(self, clip: str | None) -> tuple[str, ...]:
+        """Return the words of the CLIP's tokenizer; empty on a machine without that CLIP."""
+        if (name := self.clip or clip) is None:  # a scene of colors alone
+            return ()
+        try:
+            return whole_words(name)
+        except UserError as error:
+            say(f"The page knows the shipped words alone: {error}")
+            return ()
+
+    def _told(self) -> Provenance:
+        """Return the provenance in the scene's own file, with what the flags override."""
+        flags = {"title": self.title, "credit": self.credit, "license": self.license}
+        told = {name: text for name, text in flags.items() if text}
+        return replace(provenance_of(self.scene), made_by=Provenance.made_by, **told)
