@@ -5,7 +5,6 @@ from __future__ import annotations
 from contextlib import suppress
 from dataclasses import dataclass, field
 from math import hypot, inf
-from pathlib import Path
 
 import tyro
 
@@ -25,8 +24,6 @@ class AttachConfig(PreparationConfig):
     --up=-y). With auto, it is found by walls, and by what CLIP sees in views of the splat."""
     segment: tyro.conf.UseAppendAction[list[str]] = field(default_factory=list)
     """Word that the foreground model finds in the photos and teaches the scene. Repeat the flag for more."""
-    cache_dir: Path | None = None
-    """Folder for the prepared targets (default: lang3dxl_cache inside the photos' folder)."""
 
     def check(self) -> None:
         """Raise UserError if a setting is invalid."""

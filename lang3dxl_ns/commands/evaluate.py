@@ -102,9 +102,8 @@ class EvaluateRun(_Scored):
             results["protocol"]["taught_words_left_out"] = taught
             words = ", ".join(taught)
             say(f"Scored by text alone: what examples taught ({words}) counts where the .scene file is named")
-        write_scores(
-            self.out, self.scene or pipeline.datamanager.data.capture.folder.name, results, pipeline.device
-        )
+        scene = self.scene or pipeline.datamanager.data.capture.folder.name
+        write_scores(self.out, scene, results, pipeline.device)
 
     def _score_scene(self, place: Path) -> None:
         from lang3dxl_ns.evaluation.score_scene import labeled_photos, score_scene, score_selections

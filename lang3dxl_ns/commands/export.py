@@ -13,7 +13,7 @@ from lang3dxl_ns.commands.query import Negatives, parse_texts
 from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import make_folder, read_names
-from lang3dxl_ns.common.settings_help import showing
+from lang3dxl_ns.common.settings_help import OfScene, showing
 from lang3dxl_ns.files.scene_file import Provenance, check_scene_name, replace_scene
 from lang3dxl_ns.files.splat_file import check_splat_name
 from lang3dxl_ns.open_scene import load_scene, provenance_of
@@ -32,13 +32,11 @@ _READ_BY |= {"vocabulary": ("web",), "photos": ("web",), "all": ("out",), "hide_
 
 @showing("scene", "text", "not_", "out", "web", "scene_file", "video", "title", "all", "look", "settings")
 @dataclass(kw_only=True)
-class Export:
+class Export(OfScene):
     """Write a scene in another form. --out writes a splat file of the Gaussians that match a text, in the
     model's frame, which ordinary viewers open. --web writes a web page that answers words by itself.
     --scene-file writes the scene itself to one file, which can be queried without its run and photos."""
 
-    scene: tyro.conf.Positional[Path | None] = None
-    """A .scene file, a folder that holds one, or a run (default: the newest run under outputs/)."""
     text: tyro.conf.UseAppendAction[list[str]] = field(default_factory=list)
     """Text to search for (default: write everything). With --web, prompts that the page opens with."""
     not_: Negatives = field(default_factory=list)
@@ -70,8 +68,6 @@ class Export:
     the order of the splat that it was attached to. It needs --text and --out."""
     look: str | None = None
     """Training photo whose lighting is used, by name (default: the photo that best shows the whole scene)."""
-    clip: str | None = None
-    """Name or folder of the scene's CLIP, if it is not where the scene file says."""
     settings: Annotated[QueryConfig, tyro.conf.arg(name="")] = field(default_factory=QueryConfig)
 
     def main(self) -> None:
@@ -86,7 +82,8 @@ class Export:
                 raise UserError("a splat file is of one --text: write several files, or a page (--web)")
         scene = load_scene(self.scene, settings=self.settings, clip=self.clip)
         write = {"out": self._splat, "web": self._page, "scene_file": self._scene, "video": self._video}
-        write[target](scene, parse_texts(self.text, self.not_, scene.words))
+        prompts = parse_texts(self.text, self.not_, scene.words)
+        write[target](getattr(self, target), scene, prompts)
 
     def _target(self) -> str:
         """Return which file is written. Raises UserError unless it is one, and for options without effect."""
@@ -104,38 +101,29 @@ class Export:
             raise UserError("settings of queries have no effect without --text: leave them off, or give one")
         return targets[0]
 
-    def _splat(self, scene: Scene, prompts: list[Prompt]) -> None:
-        assert self.out is not None
-        count = scene.export(
-            self.out,
-            prompts[0] if prompts else None,
-            everything=self.all,
-            look=self.look,
-            index=self.index,
-            hide_floaters=self.hide_floaters,
-        )
-        say(f"Wrote {count} of {len(scene.splats)} Gaussians to {self.out}")
+    def _splat(self, path: Path, scene: Scene, prompts: list[Prompt]) -> None:
+        text = prompts[0] if prompts else None
+        which = {"everything": self.all, "hide_floaters": self.hide_floaters}
+        count = scene.export(path, text, look=self.look, index=self.index, **which)
+        say(f"Wrote {count} of {len(scene.splats)} Gaussians to {path}")
 
-    def _page(self, scene: Scene, prompts: list[Prompt]) -> None:
-        assert self.web is not None
+    def _page(self, folder: Path, scene: Scene, prompts: list[Prompt]) -> None:
         own = read_names(self.vocabulary, "words") if self.vocabulary else ()
         words = self._clip_words(scene.file.clip)
         page = Page(scene, prompts, own, words, self._told(), self.look, self.photos)
-        size = write_page(page, self.web)
+        size = write_page(page, folder)
         say(*(f"{left_out}." for left_out in page.left_out))
-        see = f"python -m http.server -d {shlex.quote(str(self.web))}"
-        say(f"Wrote {size / 1e6:.1f} MB to {self.web}; see it: {see}")
+        see = f"python -m http.server -d {shlex.quote(str(folder))}"
+        say(f"Wrote {size / 1e6:.1f} MB to {folder}; see it: {see}")
 
-    def _scene(self, scene: Scene, _: list[Prompt]) -> None:
-        assert self.scene_file is not None
-        _kept, size = replace_scene(self.scene_file, scene, self._told())
-        ask = f"lang3dxl query {shlex.quote(str(self.scene_file))}"
-        say(f"Wrote {size / 1e6:.1f} MB to {self.scene_file}; ask it: {ask}")
+    def _scene(self, path: Path, scene: Scene, _: list[Prompt]) -> None:
+        _kept, size = replace_scene(path, scene, self._told())
+        ask = f"lang3dxl query {shlex.quote(str(path))}"
+        say(f"Wrote {size / 1e6:.1f} MB to {path}; ask it: {ask}")
 
-    def _video(self, scene: Scene, _: list[Prompt]) -> None:
-        assert self.video is not None
-        count = write_video(self.video, scene, tour_shots(scene, self._told().tour))
-        say(f"Wrote {count} pictures, {count / RATE:.0f} seconds, to {self.video}")
+    def _video(self, path: Path, scene: Scene, _: list[Prompt]) -> None:
+        count = write_video(path, scene, tour_shots(scene, self._told().tour))
+        say(f"Wrote {count} pictures, {count / RATE:.0f} seconds, to {path}")
 
     def _clip_words(self, clip: str | None) -> tuple[str, ...]:
         """Return the words of the CLIP's tokenizer; empty on a machine without that CLIP."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import shlex
 import sys
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -58,8 +58,6 @@ class Prepare(PreparationConfig):
 
     data: Path
     """Folder of photos, with images/ and sparse/0/ or without a model, or a video."""
-    cache_dir: Path | None = None
-    """Folder for the targets (default: lang3dxl_cache inside the data folder)."""
 
     def main(self) -> None:
         from lang3dxl_ns.preparation.model_files import check_encoders
@@ -68,7 +66,7 @@ class Prepare(PreparationConfig):
 
         check_data(self.data)
         check_encoders(self.clip, self.dense)
-        prepared = _opened(self, self.data, self.cache_dir)
+        prepared = _opened(self, self.data)
         if prepared.targets is not None:
             print(f"Targets of {len(prepared.targets.names)} photos are in {prepared.cache_dir}")
         for kind, (files, size) in FeatureStore(prepared.cache_dir).sizes().items():
@@ -91,21 +89,21 @@ class Needs(PreparationConfig):
 
         # Keep nerfstudio's start-up output out of the answer.
         with contextlib.redirect_stdout(sys.stderr):
-            table = needs_table(_opened(self, self.data, None).needs)
+            table = needs_table(_opened(self, self.data).needs)
         print(table)
 
 
-def _opened(settings: PreparationConfig, data: Path, cache_dir: Path | None) -> TrainingData:
-    """Open a folder of photos with these settings. Nothing is prepared yet."""
+def _opened(settings: PreparationConfig, data: Path) -> TrainingData:
+    """Open a folder of photos with these settings, which are resolved. Nothing is prepared yet."""
     from lang3dxl_ns.common.device import best_device
     from lang3dxl_ns.scene.capture import open_capture, say_left_out
     from lang3dxl_ns.scene.companions import cache_folder
     from lang3dxl_ns.training.batches import TrainingData, settle
 
     settings.check()
-    capture = open_capture(data, cache_dir=cache_dir)
+    capture = open_capture(data, cache_dir=settings.cache_dir)
     say_left_out(capture)
     learned = settings.crops == "pyramid" or settings.regions not in ("auto", "none")
-    config = PreparationConfig(**{f.name: getattr(settings, f.name) for f in fields(PreparationConfig)})
-    settle(config, learned, gathered=not learned)
-    return TrainingData(capture, config, cache_folder(capture.folder, cache_dir), best_device(), learned)
+    settle(settings, learned, gathered=not learned)
+    cache = cache_folder(capture.folder, settings.cache_dir)
+    return TrainingData(capture, settings, cache, best_device(), learned)

@@ -18,7 +18,7 @@ from lang3dxl_ns.commands.coco import CocoLabels, check_labels_file
 from lang3dxl_ns.common.console import say, some, tracked
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import make_folder, replace_file, slugs
-from lang3dxl_ns.common.settings_help import showing
+from lang3dxl_ns.common.settings_help import OfScene, showing
 from lang3dxl_ns.open_scene import load_scene
 from lang3dxl_ns.query.answer import best_views
 from lang3dxl_ns.query.match import Match, save_picture, together
@@ -32,7 +32,7 @@ Negatives = Annotated[tyro.conf.UseAppendAction[list[str]], tyro.conf.arg(name="
 
 @showing("scene", "text", "not_", "out", "image", "all", "coco", "settings")
 @dataclass(kw_only=True)
-class Query:
+class Query(OfScene):
     """Search a trained scene for texts: write heat maps, masks and relevancy maps.
 
     Each text gets a folder in --out. For every view, it holds `….overlay.png` (heat map over the rendering),
@@ -41,8 +41,6 @@ class Query:
     written as one picture to `together`, with a color for each text and a legend.
     """
 
-    scene: tyro.conf.Positional[Path | None] = None
-    """A .scene file, a folder that holds one, or a run (default: the newest run under outputs/)."""
     text: tyro.conf.UseAppendAction[list[str]] = field(default_factory=list)
     """Text to search for, such as '"windows" not "arcades"'. Repeat the flag, or separate texts with `;`."""
     not_: Negatives = field(default_factory=list)
@@ -57,8 +55,6 @@ class Query:
     """COCO file to which the masks of all photos and texts are also written as labels. It needs --all."""
     without_taught: bool = False
     """Search for the texts only, without what the scene was taught by example (lang3dxl teach)."""
-    clip: str | None = None
-    """Name or folder of the scene's CLIP, if it is not where the scene file says."""
     settings: Annotated[QueryConfig, tyro.conf.arg(name="")] = field(default_factory=QueryConfig)
 
     def main(self) -> None:

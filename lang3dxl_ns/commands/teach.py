@@ -12,7 +12,7 @@ import tyro
 from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import file_locked
-from lang3dxl_ns.common.settings_help import showing
+from lang3dxl_ns.common.settings_help import OfScene, showing
 
 if TYPE_CHECKING:
     from lang3dxl_ns.query.scene import Scene
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 @showing("scene", "word", "photo", "mask", "box", "at", "not_at")
 @dataclass(kw_only=True)
-class Teach:
+class Teach(OfScene):
     """Show a scene what a word means, by marking it in a photo with an outline, a box, or points.
 
     The scene keeps the word. Further calls add examples, in the same photo or in others. `lang3dxl words`
@@ -42,8 +42,6 @@ class Teach:
     """Point on what the word means, in pixels of the photo: X,Y. Repeat the flag for more."""
     not_at: tyro.conf.UseAppendAction[list[str]] = field(default_factory=list)
     """Point on something else: X,Y. Repeat the flag for more."""
-    clip: str | None = None
-    """Name or folder of the scene's CLIP, if it is not where the scene file says."""
 
     def main(self) -> None:
         from lang3dxl_ns.files.scene_file import keep_words
@@ -76,7 +74,7 @@ class Teach:
 
 @showing("scene", "forget", "save", "load")
 @dataclass(kw_only=True)
-class Words:
+class Words(OfScene):
     """List the words that a scene was taught, remove them, or carry them to other scenes of the same CLIP."""
 
     scene: tyro.conf.Positional[Path | None] = None
@@ -87,8 +85,6 @@ class Words:
     """File to write the words to."""
     load: Path | None = None
     """File of words to add. Words learned in one scene often fail in another, so check them."""
-    clip: str | None = None
-    """Name or folder of the scene's CLIP, if it is not where the scene file says."""
 
     def main(self) -> None:
         from lang3dxl_ns.files.scene_file import describe_scene_file, keep_words

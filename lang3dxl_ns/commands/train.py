@@ -12,7 +12,7 @@ import tyro
 from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.settings_help import showing, without
 from lang3dxl_ns.preparation.settings import PreparationConfig
-from lang3dxl_ns.training.scene_settings import SceneSettings
+from lang3dxl_ns.training.scene_settings import RunSettings, SceneSettings
 
 if TYPE_CHECKING:
     from lang3dxl_ns.training.fit import Settings
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 )
 @without("total_steps")
 @dataclass(kw_only=True)
-class Train(SceneSettings, PreparationConfig):
+class Train(RunSettings, SceneSettings, PreparationConfig):
     """Train a scene from photos: Gaussians with colors, and words for them.
 
     Photos without a COLMAP model or a transforms.json are reconstructed first. A run that was stopped, by
@@ -44,14 +44,6 @@ class Train(SceneSettings, PreparationConfig):
     """Colors that depend on each photo's lighting. auto: where the photos differ in it."""
     photo_scale: float | None = None
     """Size of the training photos relative to the files' (default: 1, as printed 0.5)."""
-    save_every: int = 2_000
-    """Iterations between two checkpoints, at most a quarter of the run."""
-    cache_dir: Path | None = None
-    """Folder of prepared targets (default: lang3dxl_cache inside the data folder)."""
-    seed: int = 42
-    """Seed of all that is random."""
-    mixed_precision: bool = False
-    """Compute networks in bfloat16, on a GPU that multiplies it."""
     restart: bool = False
     """Train anew, over the run in the folder."""
 
@@ -59,7 +51,7 @@ class Train(SceneSettings, PreparationConfig):
         from lang3dxl_ns.training.fit import run_folder
 
         settings = self.settings()
-        folder, _ = run_folder(self.data, self.out, settings, self.cache_dir, self.restart)
+        folder, _ = run_folder(self.data, self.out, settings, self.restart)
         run = shlex.quote(str(folder))
         say(f"Walk through it: lang3dxl view {run}")
         if settings.targets.clip != "none":
@@ -70,11 +62,10 @@ class Train(SceneSettings, PreparationConfig):
         from lang3dxl_ns.training.fit import Settings
 
         settings = Settings.of(self.method, self.steps)
-        for owner, kind in ((settings.scene, SceneSettings), (settings.targets, PreparationConfig)):
+        parts = {SceneSettings: settings.scene, PreparationConfig: settings.targets, RunSettings: settings}
+        for kind, owner in parts.items():
             for name, value in _changed(self, kind).items():
                 setattr(owner, name, value)
-        for name in ("save_every", "seed", "mixed_precision"):
-            setattr(settings, name, getattr(self, name))
         settings.photo_scale = self.photo_scale or settings.photo_scale
         if self.looks != "auto":
             settings.scene.appearance.use = self.looks

@@ -14,20 +14,18 @@ import tyro
 from lang3dxl_ns.common.checks import check_address
 from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.common.settings_help import showing
+from lang3dxl_ns.common.settings_help import OfScene, showing
 
 
 @showing("scene", "text", "photos", "tour", "host", "port", "browser")
 @dataclass(kw_only=True)
-class View:
+class View(OfScene):
     """Explore and query a scene in a browser.
 
     The browser draws the Gaussians (WebGL) and answers words; this machine encodes texts. The page is the one
     of `lang3dxl export --web`, which answers the words of a vocabulary without any server.
     """
 
-    scene: tyro.conf.Positional[Path | None] = None
-    """A .scene file, a folder that holds one, or a run (default: the newest run under outputs/)."""
     text: tyro.conf.UseAppendAction[list[str]] = field(default_factory=list)
     """Prompt to start with. Repeat the flag, or separate prompts with `;`."""
     photos: Path | None = None
@@ -40,8 +38,6 @@ class View:
     """Play the tour that the page kept in the scene's file (Tour, Keep this view)."""
     browser: bool = True
     """Open the page in a browser, on a machine with a desktop (--no-browser: only print the address)."""
-    clip: str | None = None
-    """Name or folder of the scene's CLIP, if it is not where the scene file says."""
 
     def main(self) -> None:
         from lang3dxl_ns.open_scene import find_scene_file, load_scene, provenance_of

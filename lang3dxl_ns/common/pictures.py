@@ -161,9 +161,8 @@ def mask_values(image: Image.Image) -> Image.Image:
         colors = np.asarray(image.convert("RGB"))
         if (colors != colors[..., :1]).any():
             bright = colors.max(axis=2)
-            return Image.fromarray(
-                np.where(bright > 0, np.uint8(255), bright) if image.mode == "P" else bright
-            )
+            painted = image.mode == "P"
+            return Image.fromarray(np.where(bright > 0, np.uint8(255), bright) if painted else bright)
     gray = gray_values(image)
     lossless = image.format not in ("JPEG", "MPO")  # whose black may be 1 as well
     if lossless and gray.getextrema()[1] == 1:

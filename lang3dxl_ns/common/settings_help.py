@@ -4,13 +4,24 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterable
-from dataclasses import fields
+from dataclasses import dataclass, fields
+from pathlib import Path
 from types import NoneType
 from typing import Annotated, Any, TypeVar, get_args, get_type_hints
 
 import tyro
 
 Class = TypeVar("Class", bound=type)
+
+
+@dataclass(kw_only=True)
+class OfScene:
+    """Settings of every command about a scene."""
+
+    scene: tyro.conf.Positional[Path | None] = None
+    """A .scene file, a folder that holds one, or a run (default: the newest run under outputs/)."""
+    clip: str | None = None
+    """Name or folder of the scene's CLIP, if it is not where the scene file says."""
 
 
 def without(*names: str) -> Callable[[Class], Class]:

@@ -29,7 +29,7 @@ _LARGEST_BOUND_FOR_ONE_MAXIMUM = 30.0
 _ROUND_OFF = 1e-9  # share of a window; smaller coverage is rounding error, not a pixel
 
 
-@dataclass
+@dataclass(frozen=True)
 class DownsamplerConfig:
     """Settings of how a decoded map is reduced to the target grid."""
 

@@ -92,9 +92,8 @@ class HashGrid(nn.Module):
         least float32, because in 16 bits a fine level would have no fractions left."""
         if not self.levels:
             return x.new_zeros(len(x), 0)
-        x = x.to(torch.promote_types(self.table.dtype, torch.float32)).clamp(
-            -COORDINATE_LIMIT, COORDINATE_LIMIT
-        )
+        exact = torch.promote_types(self.table.dtype, torch.float32)
+        x = x.to(exact).clamp(-COORDINATE_LIMIT, COORDINATE_LIMIT)
         narrow = self.features_per_level <= _WIDEST_ROW_OF_KERNELS
         if narrow and takes_kernels(x) and x.dtype == self.table.dtype:
             return self._interpolated_by_kernels(x)

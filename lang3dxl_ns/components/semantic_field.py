@@ -232,9 +232,7 @@ def _hidden_layers(
 ) -> nn.Sequential:
     layers: list[nn.Module] = []
     for depth in range(settings.hidden_layers):
-        layers.append(
-            linear(inputs if depth == 0 else settings.hidden_width, settings.hidden_width, generator)
-        )
+        layers.append(linear(settings.hidden_width if depth else inputs, settings.hidden_width, generator))
         if settings.activation == "every" or depth == settings.hidden_layers - 1:
             layers.append(nn.ReLU())
     return nn.Sequential(*layers)

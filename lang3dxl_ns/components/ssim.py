@@ -39,9 +39,8 @@ class _Similarity(torch.autograd.Function):
         # Derivatives by the blurred prediction, its blurred square, and the blurred product.
         slopes = np.empty((3, channels * lines, _padded(width)), images[0].dtype)
         parts = ranges(channels * lines)
-        sums = in_threads(
-            _similarity, [(*part, *images, channels, height, width, weights, slopes) for part in parts]
-        )
+        given = (*images, channels, height, width, weights, slopes)
+        sums = in_threads(_similarity, [(*part, *given) for part in parts])
         ctx.images, ctx.slopes, ctx.weights, ctx.shape = images, slopes, weights, prediction.shape
         return prediction.new_tensor(sum(sums) / (channels * lines * (width - WINDOW + 1)))
 

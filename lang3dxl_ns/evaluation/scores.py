@@ -154,10 +154,7 @@ def softened(maps: Maps, temperature: float) -> Maps:
 
 
 def _each(maps: Maps, change: Callable[[Float[Array, "h w"]], Float[Array, "h w"]]) -> Maps:
-    return {
-        name: torch.from_numpy(change(scores.cpu().numpy())).to(scores.device)
-        for name, scores in maps.items()
-    }
+    return {k: torch.from_numpy(change(m.cpu().numpy())).to(m.device) for k, m in maps.items()}
 
 
 def score_maps(

@@ -222,9 +222,8 @@ def read_glb(path: Path) -> Splats:
     means, scales = (tensor_of(file.values(named[name], 3)) for name in ("POSITION", f"{_SPLATS}:SCALE"))
     quats = np.roll(file.values(named[f"{_SPLATS}:ROTATION"], 4), 1, axis=1)
     opacities = file.values(named[f"{_SPLATS}:OPACITY"], 1)[:, 0]
-    harmonics = np.stack(
-        [file.values(named[_harmonic(band)], 3) for band in range((degree + 1) ** 2)], axis=1
-    )
+    bands = [file.values(named[_harmonic(band)], 3) for band in range((degree + 1) ** 2)]
+    harmonics = np.stack(bands, axis=1)
     sizes = {len(means), len(quats), len(scales), len(opacities), len(harmonics)}
     expect(len(sizes) == 1, "its attributes differ in size")
     antialiased = bool((found.get("extras") or {}).get("antialiased", False))

@@ -133,9 +133,8 @@ def _zstd_parts(after: bytes, sizes: list[int], streams: int) -> list[bytes]:
 
 
 def _decoded(parts: list[bytes], count: int, version: int, bits: int, flags: int) -> Splats:
-    places, alphas, colors, scales, turns, *others = (
-        np.frombuffer(part, np.uint8).reshape(count, -1) for part in parts
-    )
+    rows = [np.frombuffer(part, np.uint8).reshape(count, -1) for part in parts]
+    places, alphas, colors, scales, turns, *others = rows
     if version == 1:
         means = places.view("<f2").astype(np.float32)
     else:

@@ -56,8 +56,6 @@ class Lang3DXLDataManagerConfig(PreparationConfig, FullImageDatamanagerConfig):
     _target: type = field(default_factory=lambda: Lang3DXLDataManager)
     dataparser: AnnotatedDataParserUnion = field(default_factory=PhotoCollectionDataParserConfig)
     """Source of photos and cameras."""
-    cache_dir: Path | None = None
-    """Folder of prepared targets (default: lang3dxl_cache inside the data folder)."""
     cache_gb: float | None = None
     """Memory in gigabytes for decoded photos and their targets. The first photos that fit are kept, and the
     others are read ahead of their use. Default: a quarter of the machine's memory."""

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import torch
@@ -25,40 +24,18 @@ from lang3dxl_ns.plugin.inert_settings import OF_COLMAP
 from lang3dxl_ns.scene.camera import view_matrix
 from lang3dxl_ns.scene.capture import Capture, CaptureSettings, Split, find_source, open_capture, say_left_out
 from lang3dxl_ns.scene.colmap import Reconstruction, TrackedPhoto
-from lang3dxl_ns.scene.frame import Center, Frame, Orientation
+from lang3dxl_ns.scene.frame import Frame
 from lang3dxl_ns.scene.record import SCENE_FILE, SceneRecord
 
 
 @without(*OF_COLMAP)
 @dataclass
-class PhotoCollectionDataParserConfig(ColmapDataParserConfig):
+class PhotoCollectionDataParserConfig(CaptureSettings, ColmapDataParserConfig):  # type: ignore[misc]
     """Settings of a folder with photos and a COLMAP model or a transforms.json, and optionally masks/."""
 
     _target: type = field(default_factory=lambda: PhotoCollectionDataParser)
-    colmap_path: Path = Path("sparse/0")
-    """COLMAP model, relative to the data folder; sparse, colmap/sparse/0 and dense/sparse are tried too."""
-    images_path: Path = Path("images")
-    """Folder of the photos, relative to the data folder; dense/images is tried too."""
-    masks_path: Path | None = Path("masks")
-    """Folder of foreground masks, named like the photos (.png or .jpg); white marks what to keep. A photo
-    without a mask is used whole. --pipeline.datamanager.foreground has other sources."""
-    held_out: Path | None = None
-    """Text file with names of the photos to hold out of training, one per line, with or without suffix, in
-    place of every eighth photo. `lang3dxl evaluate split` makes one from ground truth."""
-    follow_links: bool = False
-    """Whether photos and masks may be symbolic links that leave their folder."""
-    eval_mode: Literal["interval", "all"] = "interval"
-    orientation_method: Orientation = "up"
-    center_method: Center = "poses"
     downscale_factor: int | None = 1
     """Always 1, since photos are resized on reading (--pipeline.datamanager.camera-res-scale-factor)."""
-
-    def capture_settings(self) -> CaptureSettings:
-        """Return the settings of the capture. The default model is none that was named."""
-        values = {f.name: getattr(self, f.name) for f in fields(CaptureSettings)}
-        if self.colmap_path == type(self)().colmap_path:
-            values["colmap_path"] = None
-        return CaptureSettings(**values)
 
 
 @dataclass
@@ -118,7 +95,7 @@ class PhotoCollectionDataParser(DataParser):
                 f"--downscale-factor is {self.config.downscale_factor}: leave it at 1, resize photos with "
                 "--pipeline.datamanager.camera-res-scale-factor"
             )
-        capture = open_capture(self.config.data, self.config.capture_settings(), may_reconstruct=False)
+        capture = open_capture(self.config.data, self.config, may_reconstruct=False)
         say_left_out(capture)
         if len(capture.photos) == 1:
             need = "a scene needs at least two, one to learn from and one to hold out"
@@ -189,13 +166,12 @@ def parser_for(
             f"{type(config).__name__} is not read here: leave the dataparser's name off, so that the COLMAP "
             "model or transforms.json of the folder is found, or make one with ns-process-data"
         )
-    settings = config.capture_settings()
-    folder, source = find_source(config.data, settings, cache_dir, may_reconstruct)
+    folder, source = find_source(config.data, config, cache_dir, may_reconstruct)
     if source.suffix == ".json":
         config.data = source
     else:
         config.data = folder
-        if settings.colmap_path is None:
+        if config.colmap_path is None:
             config.colmap_path = source.relative_to(folder) if source.is_relative_to(folder) else source
     return config
 

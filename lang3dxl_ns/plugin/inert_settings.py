@@ -17,7 +17,7 @@ OF_SPLATFACTO = (
     *("cull_scale_thresh", "cull_screen_size", "split_screen_size", "stop_screen_size_at"),
     *("use_scale_regularization", "max_gauss_ratio", "use_bilateral_grid", "grid_shape"),
     *("color_corrected_metrics", "resolution_schedule", "num_downscales", "output_depth_during_training"),
-    "use_absgrad",
+    *("use_absgrad", "camera_optimizer"),
 )
 """Settings of splatfacto's own schedule and parts, which this model does not have."""
 OF_IMAGE_CACHES = (
@@ -51,11 +51,9 @@ def check_inert(
     changed = _changed(model, _OF_RENDERINGS, "--pipeline.model.")
     changed += _changed(model.semantic_field, ("code_std",), "--pipeline.model.semantic-field.")
     default = parameter_groups(learning_rates())
-    changed += [
-        f"--optimizers.{name.replace('_', '-')}"
-        for name in _GROUPS_OF_RENDERINGS
-        if optimizers is not None and optimizers[name] != default[name]
-    ]
+    given = default if optimizers is None else optimizers
+    groups = [name for name in _GROUPS_OF_RENDERINGS if given[name] != default[name]]
+    changed += [f"--optimizers.{name.replace('_', '-')}" for name in groups]
     if data.regions not in ("auto", "none"):
         changed.append("--pipeline.datamanager.regions")
     if changed:

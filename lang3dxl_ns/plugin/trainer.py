@@ -242,14 +242,9 @@ class Lang3DXLTrainer(Trainer):
         return GuardedOptimizers(self.config.optimizers.copy(), groups, self._step_is_sound)
 
     def _step_is_sound(self, grad_scaler: GradScaler) -> bool:
-        scale = grad_scaler.get_scale()
-        sound = self.guard.allows(
-            self.step,
-            self.pipeline.datamanager.data.photo_in_hand,
-            self.pipeline.last_losses,
-            self.optimizers.live_parameters(),
-            scale,
-        )
+        scale, photo = grad_scaler.get_scale(), self.pipeline.datamanager.data.photo_in_hand
+        losses, parameters = self.pipeline.last_losses, self.optimizers.live_parameters()
+        sound = self.guard.allows(self.step, photo, losses, parameters, scale)
         # Densification accumulates the gradients of screen positions, which are just as broken, and scaled
         # alike.
         self.pipeline.model.run.step_is_sound = sound
@@ -392,10 +387,8 @@ class Lang3DXLTrainer(Trainer):
         told = Provenance(title=path.stem, made_how=how)
         _, size = replace_scene(path, scene, told, *earlier)
         run = shlex.quote(os.path.relpath(self.base_dir))
-        say(
-            f"The scene:       {os.path.relpath(path)} ({size / 1e6:.1f} MB)",
-            f"Walk through it: lang3dxl view {run}",
-        )
+        say(f"The scene:       {os.path.relpath(path)} ({size / 1e6:.1f} MB)")
+        say(f"Walk through it: lang3dxl view {run}")
         if model.semantic_field is not None:
             say(f"Ask it:          lang3dxl query {run} --text windows --out found")
 

@@ -51,9 +51,8 @@ def value_value_patches(model: Any, pictures: Float[Tensor, "n 3 h w"]) -> Float
     for layer in layers:
         hidden = layer(hidden, None)
     attention = last.self_attn
-    values = (
-        attention.v_proj(last.layer_norm1(hidden)).unflatten(-1, (-1, attention.head_dim)).transpose(1, 2)
-    )
+    values = attention.v_proj(last.layer_norm1(hidden))
+    values = values.unflatten(-1, (-1, attention.head_dim)).transpose(1, 2)
     mixed = F.scaled_dot_product_attention(values, values, values, scale=attention.scale)
     patches = attention.out_proj(mixed.transpose(1, 2).flatten(2))[:, 1:]
     return model.visual_projection(tower.post_layernorm(patches))

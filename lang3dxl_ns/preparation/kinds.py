@@ -77,7 +77,7 @@ class Networks:
             _ = self.dense
 
 
-@dataclass
+@dataclass(frozen=True)
 class Target(ABC):
     """One entry of the store for one photo. Targets are sent to other processes, networks are not."""
 
@@ -97,7 +97,7 @@ class Target(ABC):
         return 0, 0
 
 
-@dataclass
+@dataclass(frozen=True)
 class CropGrid(Target):
     """Embeddings of a photo's crops, averaged over their sizes."""
 
@@ -118,7 +118,7 @@ class CropGrid(Target):
         return self.crops.count(*size), self.fast.count(*size)
 
 
-@dataclass
+@dataclass(frozen=True)
 class PatchMap(Target):
     """Map of an image-text encoder's patch features, from windows of the photo."""
 
@@ -152,7 +152,7 @@ class DenseFeatures(Target):
         return networks.dense.tokens**2 * networks.dense.dim
 
 
-@dataclass
+@dataclass(frozen=True)
 class RegionLabels(Target):
     """Label map of the photo's regions."""
 
@@ -165,7 +165,7 @@ class RegionLabels(Target):
         return math.prod(label_size(self.photo.height, self.photo.width))
 
 
-@dataclass
+@dataclass(frozen=True)
 class Sources:
     """Where a scene's targets come from."""
 
@@ -184,11 +184,8 @@ class Sources:
         """Yield a photo's targets. `content` is the hash of its file, `crops` are the crops to encode, and
         `fast` those with `--quality fast`."""
         # What determines the photo's pixels; the lens matters only if it is undistorted.
-        source: Recipe = {
-            "photo": content,
-            "size": [photo.width, photo.height],
-            "undistorted": photo.lens.undistortion,
-        }
+        size, lens = [photo.width, photo.height], photo.lens.undistortion
+        source: Recipe = {"photo": content, "size": size, "undistorted": lens}
         if photo.quarter_turns:
             source["turned"] = photo.quarter_turns
         fine, kind = photo.name in self.fine, FINE if photo.name in self.fine else CLIP

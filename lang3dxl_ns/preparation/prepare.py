@@ -54,7 +54,7 @@ _LONG_S = 1800.0
 """Duration on a CPU, in seconds, above which ways to shorten it are suggested."""
 
 
-@dataclass
+@dataclass(frozen=True)
 class _Task:
     """A photo, its targets, and those that are still to be made."""
 

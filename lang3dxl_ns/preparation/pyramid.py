@@ -16,7 +16,7 @@ from lang3dxl_ns.preparation.physical_scale import SMALLEST_CROP, crop_sides, fi
 from lang3dxl_ns.preparation.settings import Quality
 
 
-@dataclass
+@dataclass(frozen=True)
 class ClipTarget:
     """Image embeddings of a photo's crops, averaged over the scales, on the grid of the smallest scale.
 
@@ -114,12 +114,12 @@ def _encode_scale(
 ) -> Float[Tensor, "c+1 ny nx"]:
     """Encode one scale's crops to a grid of embeddings, with the valid fraction as the last channel; batches
     become smaller if memory runs out."""
-    features = with_less_memory(
-        lambda batch: torch.cat(
-            [encode(crops).float() for crops in iterate_crops(photo, side, crop_size, batch, steps)]
-        ),
-        batch_size,
-    )
+
+    def encoded(batch: int) -> Tensor:
+        crops = iterate_crops(photo, side, crop_size, batch, steps)
+        return torch.cat([encode(part).float() for part in crops])
+
+    features = with_less_memory(encoded, batch_size)
     valid = valid_fractions(photo.shape[0], photo.shape[1], side, steps).to(features)
     return torch.cat([features.T.unflatten(1, valid.shape), valid[None]])
 

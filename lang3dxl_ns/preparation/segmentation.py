@@ -36,12 +36,8 @@ _BOX_THRESHOLD = 0.3
 """Minimum confidence of a box (LangSAM's)."""
 # These are LangSplat's settings of SAM's automatic masks, published for language fields. Its extra round over
 # crops of the photo is omitted: it takes five times as long and finds masks too small for the label maps.
-_AUTOMATIC = {
-    "points_per_crop": 32,
-    "pred_iou_thresh": 0.7,
-    "stability_score_thresh": 0.85,
-    "crops_nms_thresh": 0.7,
-}
+_AUTOMATIC = {"points_per_crop": 32, "crops_nms_thresh": 0.7}
+_AUTOMATIC |= {"pred_iou_thresh": 0.7, "stability_score_thresh": 0.85}
 
 
 class TextSegmenter(Protocol):
@@ -241,9 +237,8 @@ class AutomaticSam:
 
     def masks(self, image: UInt8[Tensor, "h w 3"]) -> list[Bool[Tensor, "h w"]]:
         """Find all masks, at the size of the image, on the CPU; empty if there are none."""
-        return [
-            torch.as_tensor(mask).cpu() for mask in self._generate(_picture(image), **_AUTOMATIC)["masks"]
-        ]
+        found = self._generate(_picture(image), **_AUTOMATIC)
+        return [torch.as_tensor(mask).cpu() for mask in found["masks"]]
 
 
 def _picture(image: UInt8[Tensor, "h w 3"]) -> Image.Image:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 from lang3dxl_ns.common.checks import check_numbers
@@ -21,13 +22,8 @@ DENSE_MODEL = "facebook/dinov2-small"
 """Dense encoder for semantics that are trained with the scene."""
 
 
-_BOUNDS = {
-    "longer_side": (16, 1 << 16),
-    "scales": (1, 100),
-    "dense_tokens": (1, 1024),
-    "crop_batch": (1, 1 << 16),
-    "workers": (1, 1024),
-}
+_BOUNDS = {"longer_side": (16, 1 << 16), "scales": (1, 100), "dense_tokens": (1, 1024)}
+_BOUNDS |= {"crop_batch": (1, 1 << 16), "workers": (1, 1024)}
 
 
 @dataclass
@@ -116,6 +112,8 @@ class PreparationConfig:
     sam: str = "facebook/sam-vit-base"
     """SAM for regions and for boxes: a name or a folder. The authors use facebook/sam-vit-huge, which is
     several times as slow; label maps are too small to show much difference."""
+    cache_dir: Path | None = None
+    """Folder of prepared targets (default: lang3dxl_cache inside the data folder)."""
 
     def check(self) -> None:
         """Raise UserError for invalid options, before any work."""

@@ -22,7 +22,7 @@ FACTS = "lang3dxl"
 """Key of a scene's facts in a dataset's metadata, which nerfstudio hands to the model."""
 
 
-@dataclass
+@dataclass(frozen=True)
 class StoredClipTarget(ClipTarget):
     """CLIP target of a photo, memory-mapped (CPU, float16)."""
 
@@ -30,7 +30,7 @@ class StoredClipTarget(ClipTarget):
     """Crop sides as fractions of the photo's width, ascending."""
 
 
-@dataclass
+@dataclass(frozen=True)
 class ChannelStatistics:
     """Mean and standard deviation per channel; deviations are at least 1 % of their average."""
 
@@ -38,7 +38,7 @@ class ChannelStatistics:
     std: Float[Tensor, " c"]
 
 
-@dataclass
+@dataclass(frozen=True)
 class FeatureStatistics:
     """Statistics of the CLIP and the dense targets, for whitening the field's output."""
 

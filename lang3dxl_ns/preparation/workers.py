@@ -51,9 +51,8 @@ _work: Any = None
 def _run_in_processes(count: int, start: Start[Item, Result], items: Sequence[Item], device: str):
     context = get_context("spawn")  # a forked process can't use CUDA
     turn = context.Value("i", 0)
-    pool = ProcessPoolExecutor(
-        count, mp_context=context, initializer=_start, initargs=(start, device, count, turn)
-    )
+    how = start, device, count, turn
+    pool = ProcessPoolExecutor(count, mp_context=context, initializer=_start, initargs=how)
     try:
         futures = {pool.submit(_do, item): item for item in items}
         for future in as_completed(futures):

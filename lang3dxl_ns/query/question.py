@@ -27,18 +27,12 @@ from lang3dxl_ns.rendering import Rendering
 
 COVERED = 0.3
 """Share of a pixel that matching Gaussians must cover; below 0.5, because most are small and edges blend."""
-_BOUNDS = {
-    "temperature": (1e-3, 1e4),
-    "threshold": (0, 1),
-    "min_alpha": (0, 1),
-    "size": (1, 1 << 16),
-    "views": (1, 1e6),
-    "view_side": (8, 8192),
-}
+_BOUNDS = {"temperature": (1e-3, 1e4), "threshold": (0, 1), "min_alpha": (0, 1)}
+_BOUNDS |= {"size": (1, 1 << 16), "views": (1, 1e6), "view_side": (8, 8192)}
 
 
 @showing("threshold", "foreground")
-@dataclass
+@dataclass(frozen=True)
 class QueryConfig:
     """Settings of queries."""
 

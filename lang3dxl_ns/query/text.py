@@ -117,7 +117,7 @@ def caution(text: str) -> str | None:
 # ── settings ────────────────────────────────────────────────────────────────────────────────────────────
 
 
-@dataclass
+@dataclass(frozen=True)
 class TextConfig:
     """Settings of how prompts become vectors."""
 

@@ -71,7 +71,7 @@ class Gaussians:
         return replace(self, means=self.means + by)
 
 
-@dataclass
+@dataclass(frozen=True)
 class Ellipses:
     """Gaussians projected to the screen. Radius and opacity are 0 for those not visible."""
 
@@ -89,7 +89,7 @@ class Ellipses:
     """Three standard deviations along the long axis, whole pixels; 0 if not visible."""
 
 
-@dataclass
+@dataclass(frozen=True)
 class Raster:
     """Maps of one rasterization, as training needs them."""
 

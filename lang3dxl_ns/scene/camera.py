@@ -137,7 +137,7 @@ def rigid(rows: Any) -> tuple[Float64[Array, "3 4"], float]:
     return np.column_stack([left @ right, pose[:3, 3]]), float(sizes.mean())
 
 
-@dataclass
+@dataclass(frozen=True)
 class Camera:
     """Pinhole camera without distortion and skew; OpenCV axes (x right, y down, z forward)."""
 

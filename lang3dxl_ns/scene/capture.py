@@ -59,13 +59,17 @@ class CaptureSettings:
     """Where a capture's parts are, and how it is split and normalized."""
 
     colmap_path: Path | None = None
-    """Folder of the COLMAP model, relative to the capture's; None: the first of the usual places."""
+    """COLMAP model, relative to the data folder (default: sparse/0, sparse, colmap/sparse/0 or
+    dense/sparse)."""
     images_path: Path = Path("images")
-    """Folder of the model's photos, relative to the capture's; where it has none, the photos are found."""
+    """Folder of the photos, relative to the data folder; dense/images is tried too."""
     masks_path: Path | None = Path("masks")
-    """Folder of foreground masks, relative to the capture's; None: no masks."""
+    """Folder of foreground masks, relative to the data folder, named like the photos (.png or .jpg); white
+    marks what to keep. A photo without a mask is used whole. --pipeline.datamanager.foreground has other
+    sources."""
     held_out: Path | None = None
-    """Text file with names of the photos to hold out, in place of a rule."""
+    """Text file with names of the photos to hold out of training, one per line, with or without suffix, in
+    place of every eighth photo. `lang3dxl evaluate split` makes one from ground truth."""
     follow_links: bool = False
     """Whether photos and masks may be symbolic links that leave their folder."""
     eval_mode: Literal["interval", "all"] = "interval"

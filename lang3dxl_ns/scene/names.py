@@ -41,9 +41,8 @@ def name_finder(files: Iterable[str]) -> Callable[[str], list[str]]:
         if not (parts := normal_parts(name)):
             return []
         *folders, last = parts
-        return _deepest(
-            tuple(folders), by_name.get(last) or by_stem.get(last) or by_stem.get(_stem(last), [])
-        )
+        fitting = by_name.get(last) or by_stem.get(last) or by_stem.get(_stem(last), [])
+        return _deepest(tuple(folders), fitting)
 
     return find
 

@@ -33,6 +33,7 @@ from lang3dxl_ns.training.estimate import check_device, estimate
 from lang3dxl_ns.training.learn_codes import begin_codes, forget_words, learn_words
 from lang3dxl_ns.training.learning_rates import Rates, learning_rates, printed_learning_rates
 from lang3dxl_ns.training.memory import out_of_memory, plan
+from lang3dxl_ns.training.scene_settings import RunSettings
 from lang3dxl_ns.training.settings import PRINTED_PHOTO_SCALE, TrainingSettings, as_printed
 from lang3dxl_ns.training.snapshot import snapshot
 from lang3dxl_ns.training.state import Training
@@ -47,7 +48,7 @@ STEPS_ON_A_CPU = 3_000
 
 
 @dataclass
-class Settings:
+class Settings(RunSettings):
     """Settings of a run."""
 
     method: Method = "lang3dxl"
@@ -58,11 +59,6 @@ class Settings:
     rates: Rates = field(default_factory=learning_rates)
     photo_scale: float = 1.0
     """Size of the training photos relative to the files'."""
-    seed: int = 42
-    save_every: int = 2_000
-    """Iterations between two checkpoints, at most a quarter of the run."""
-    mixed_precision: bool = False
-    """Compute networks in bfloat16, on a GPU that multiplies it."""
     max_skipped_steps: int = 20
     """Most steps in a row without a finite loss or gradient before the run stops."""
 
@@ -96,10 +92,8 @@ class Run:
 
     def __init__(self, capture: Capture, settings: Settings, folder: Path, cache_dir: Path, device: str):
         self.settings, self.folder, self.device = settings, folder, device
-        self.data = TrainingData(
-            capture, settings.targets, cache_dir, device, settings.scene.learns_from_renderings,
-            settings.photo_scale,
-        )  # fmt: skip
+        learned, scale = settings.scene.learns_from_renderings, settings.photo_scale
+        self.data = TrainingData(capture, settings.targets, cache_dir, device, learned, scale)
         self.path = folder / f"{capture.folder.name or 'scene'}{SUFFIX}"
         self.start, self.words_are_learned, self.title = 0, False, self.path.stem
         points, colors = map(torch.from_numpy, capture.seeds)
@@ -284,23 +278,19 @@ def fit(capture: Capture, settings: Settings, out: Path, cache_dir: Path, device
 
 
 def run_folder(
-    data: str | Path,
-    out: str | Path | None,
-    settings: Settings,
-    cache_dir: Path | None = None,
-    restart: bool = False,
+    data: str | Path, out: str | Path | None, settings: Settings, restart: bool = False
 ) -> tuple[Path, Scene]:
     """Open the capture in a folder, and train it as `fit`; return the folder of the run, by default
     outputs/NAME, and the scene. `restart` forgets the folder's run. Raises as `fit`."""
     check_data(expanded(data))
     settings.resolve()
     check_encoders(settings.targets.clip, settings.targets.dense)
-    capture = open_capture(data, cache_dir=cache_dir)
+    capture = open_capture(data, cache_dir=settings.targets.cache_dir)
     say_left_out(capture)
     folder = Path("outputs") / (capture.folder.name or "scene") if out is None else expanded(out)
     if restart:
         (folder / CHECKPOINT).unlink(missing_ok=True)
-    cache = cache_folder(capture.folder, cache_dir)
+    cache = cache_folder(capture.folder, settings.targets.cache_dir)
     return folder, fit(capture, settings, folder, cache)
 
 

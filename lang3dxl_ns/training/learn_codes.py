@@ -80,14 +80,8 @@ def forget_words(run: Training) -> None:
 
 def _target_view(run: Training, view: PhotoCamera, batch: Batch) -> TargetView:
     camera = resized(view.camera(run.pose(view)).detach(), LONGER_SIDE)
-    splats, size = run.splats(), (camera.height, camera.width)
-    return TargetView(
-        partial(composite, splats, camera),
-        size,
-        batch["clip_target"],
-        batch.get("dense_target"),
-        foreground(batch),
-    )
+    seen, size = partial(composite, run.splats(), camera), (camera.height, camera.width)
+    return TargetView(seen, size, batch["clip_target"], batch.get("dense_target"), foreground(batch))
 
 
 # A training step's autocast would keep 16-bit copies of the first weights through all steps of the fit.

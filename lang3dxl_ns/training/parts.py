@@ -22,19 +22,20 @@ from lang3dxl_ns.components.feature_decoder import Decoder
 from lang3dxl_ns.components.sky import OPACITY, Sky
 from lang3dxl_ns.preparation.targets import SceneFacts
 from lang3dxl_ns.training.gaussians import Parameters
-from lang3dxl_ns.training.settings import CameraRefinementConfig, TrainingSettings
+from lang3dxl_ns.training.settings import TrainingSettings
 
 Extent = tuple[Float[Tensor, "3"], float]
 """Center of the scene, and the distance from it that contains most of the scene, world units."""
+_SHIFT_WEIGHT, _TURN_WEIGHT = 1e-2, 1e-3
+"""Weights of the mean length of the cameras' translations, world units, and of their mean angle, radians."""
 
 
 class CameraRefinement(nn.Module):
     """A small motion of every training camera: a translation (world units), and a rotation vector (radians)
     about the camera's center."""
 
-    def __init__(self, count: int, config: CameraRefinementConfig) -> None:
+    def __init__(self, count: int) -> None:
         super().__init__()
-        self.config = config
         self.pose_adjustment = Parameter(torch.zeros(count, 6))
 
     def forward(self, poses: Float[Tensor, "k 3 4"], photos: slice) -> Float[Tensor, "k 3 4"]:
@@ -59,8 +60,7 @@ class CameraRefinement(nn.Module):
     def penalty(self) -> Float[Tensor, ""]:
         """Compute the loss that keeps cameras near their places."""
         shifts, turns = self.pose_adjustment.split(3, dim=1)
-        weights = self.config.trans_l2_penalty, self.config.rot_l2_penalty
-        return shifts.norm(dim=-1).mean() * weights[0] + turns.norm(dim=-1).mean() * weights[1]
+        return _SHIFT_WEIGHT * shifts.norm(dim=-1).mean() + _TURN_WEIGHT * turns.norm(dim=-1).mean()
 
     def figures(self) -> dict[str, Tensor]:
         """Return mean and maximum of the translations and of the rotations (degrees), for the log."""
@@ -105,7 +105,7 @@ class Parts:
         refined = facts.wants("camera optimizer", settings.camera_optimization, False)
         return Parts(
             build_sky(settings, gaussians, extent) if settings.sky_gaussians > 0 and not lighting else None,
-            build_cameras(settings, facts) if refined or settings.camera_optimizer.mode != "off" else None,
+            build_cameras(facts) if refined else None,
             None if facts.statistics is None else build_semantics(settings, facts, gaussians, extent),
             build_looks(settings, facts, extent) if lighting else None,
         )
@@ -150,7 +150,7 @@ class Parts:
         device = gaussians["means"].device
         found = replace(self, sky=_matching_sky(self.sky, state, device))
         if "camera_optimizer.pose_adjustment" in state and self.cameras is None:
-            found = replace(found, cameras=build_cameras(settings, facts).to(device))
+            found = replace(found, cameras=build_cameras(facts).to(device))
         if "clip_mean" in state:
             semantics = _matching_semantics(self.semantics, state, settings, gaussians, extent)
             found = replace(found, semantics=semantics)
@@ -161,9 +161,8 @@ class Parts:
                     f"the checkpoint was trained {'with' if lit else 'without'} appearance: load it with "
                     f"{model_option('appearance.use')} auto, or train anew"
                 )
-            found = replace(
-                found, appearance=build_looks(settings, facts, extent).to(device) if lit else None
-            )
+            looks = build_looks(settings, facts, extent).to(device) if lit else None
+            found = replace(found, appearance=looks)
         return found
 
 
@@ -175,9 +174,9 @@ def build_sky(settings: TrainingSettings, gaussians: Parameters, extent: Extent)
     return Sky(gaussians["means"].detach()[:count] - extent[0])
 
 
-def build_cameras(settings: TrainingSettings, facts: SceneFacts) -> CameraRefinement:
+def build_cameras(facts: SceneFacts) -> CameraRefinement:
     """Build motions of the training cameras, all 0."""
-    return CameraRefinement(len(facts.names), settings.camera_optimizer)
+    return CameraRefinement(len(facts.names))
 
 
 def build_looks(settings: TrainingSettings, facts: SceneFacts, extent: Extent) -> AppearanceField:

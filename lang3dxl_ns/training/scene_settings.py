@@ -6,6 +6,18 @@ from dataclasses import dataclass
 from typing import Literal
 
 
+@dataclass(kw_only=True)
+class RunSettings:
+    """Settings of a run without nerfstudio: numbers and choices."""
+
+    seed: int = 42
+    """Seed of all that is random."""
+    save_every: int = 2_000
+    """Iterations between two checkpoints, at most a quarter of the run."""
+    mixed_precision: bool = False
+    """Compute networks in bfloat16, on a GPU that multiplies it."""
+
+
 @dataclass
 class SceneSettings:
     """Settings of Gaussians, losses and schedules: numbers and choices."""

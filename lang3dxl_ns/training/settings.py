@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from operator import attrgetter
-from typing import Literal
 
 from lang3dxl_ns.common.checks import check_numbers
 from lang3dxl_ns.common.console import say
@@ -55,18 +54,6 @@ _OF_PARTS: dict[str, dict[str, tuple[float, float]]] = {
 
 
 @dataclass
-class CameraRefinementConfig:
-    """Settings of the refinement of cameras."""
-
-    mode: Literal["off", "SO3xR3"] = "off"
-    """SO3xR3: every training camera learns a rotation and a translation."""
-    trans_l2_penalty: float = 1e-2
-    """Weight of the mean length of the translations, world units."""
-    rot_l2_penalty: float = 1e-3
-    """Weight of the mean angle of the rotations, radians."""
-
-
-@dataclass
 class TrainingSettings(SceneSettings):
     """Settings of Gaussians, their parts, losses and schedules."""
 
@@ -78,8 +65,6 @@ class TrainingSettings(SceneSettings):
     """Settings of the training-only network that reduces decoded features to the CLIP target's grid."""
     appearance: AppearanceConfig = field(default_factory=AppearanceConfig)
     """Settings of colors that depend on each photo's lighting."""
-    camera_optimizer: CameraRefinementConfig = field(default_factory=CameraRefinementConfig)
-    """How cameras are refined."""
 
     def check(self) -> None:
         """Raise UserError if a setting is out of its range."""
@@ -144,10 +129,7 @@ def as_printed(settings: TrainingSettings, targets: PreparationConfig) -> None:
     settings.densify_from, settings.densify_until, settings.densify_every = 2_000 * x, 15_000 * x, 2_000 * x
     settings.densify_size_thresh = 0.2 * EXTENT
     settings.view_dependence, settings.camera_optimization = "on", "off"
-    settings.appearance.use, settings.appearance.preset, settings.appearance.opacity_shift = (
-        "on",
-        "auto",
-        True,
-    )
+    looks = settings.appearance
+    looks.use, looks.preset, looks.opacity_shift = "on", "auto", True
     targets.scale_mode, targets.pixel_distance = "physical", "mean-inner"
     targets.regions, targets.sam = "sam", "facebook/sam-vit-huge"

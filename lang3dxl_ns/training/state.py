@@ -39,9 +39,8 @@ class PhotoCamera:
 
     def camera(self, pose: Float[Tensor, "3 4"] | None = None) -> Camera:
         """Return the rasterizer's camera, at this pose or at a refined one."""
-        return Camera(
-            view_matrix(self.pose if pose is None else pose), self.intrinsics, self.width, self.height
-        )
+        view = view_matrix(self.pose if pose is None else pose)
+        return Camera(view, self.intrinsics, self.width, self.height)
 
 
 @dataclass(eq=False)

@@ -119,9 +119,8 @@ def _semantic_losses(
     ramp = semantic_ramp(run.step / c.total_steps, c.semantic_ramp)
     clip, dense = semantics.decoder(codes)
     small_mask = None if mask is None else resize_nearest(mask, (codes.shape[0], codes.shape[1]))
-    predicted, target, weight = semantics.downsampler.match(
-        clip, batch["clip_target"], batch["crop_sides"], small_mask
-    )
+    wanted = batch["clip_target"], batch["crop_sides"]
+    predicted, target, weight = semantics.downsampler.match(clip, *wanted, small_mask)
     # Cells with little foreground have a low weight.
     difference = compared.clip_loss(predicted, target, None if small_mask is None else weight)
     loss = {"clip": ramp * c.clip_weight * difference}
