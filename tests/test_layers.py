@@ -135,7 +135,7 @@ def test_a_planted_string_is_found():
 OWN = {"model", "pipeline", "scene", "trainer", "decoder", "splats", "camera", "config", "datamanager"}
 """Names of parameters and fields that hold classes of this package or of nerfstudio."""
 STILL_ANY = {
-    *("preparation/encoders.py model", "preparation/families.py model"),  # models of transformers
+    *("preparation/encoders.py model", "preparation/families.py model")  # models of transformers
 }
 """Classes of other packages."""
 

@@ -73,10 +73,7 @@ def test_commands_run_from_it_alone(wheel, tmp_path):
     zipfile.ZipFile(wheel).extractall(tmp_path / "installed")
     environment = os.environ | {"PYTHONPATH": str(tmp_path / "installed")}
     write_scene(tmp_path / "scene", photos=4)
-    commands = [
-        "preset",
-        "prepare --data scene --clip builtin --scale-range 0.5 1.5 --dense-tokens 8",
-    ]
+    commands = ["preset", "prepare --data scene --clip builtin --scale-range 0.5 1.5 --dense-tokens 8"]
     code = "import lang3dxl_ns, sys; from lang3dxl_ns.cli import main; print(lang3dxl_ns.__file__)\n"
     code += "for words in sys.argv[1:]: main(words.split())"
     done = subprocess.run(

@@ -29,12 +29,7 @@ def make_tiny_clip(folder: Path, dim: int = 64, image_size: int = 32, seed: int 
 
 def make_tiny_clipseg(folder: Path, image_size: int = 32, seed: int = 0) -> Path:
     """A CLIPSeg with its processor and a tokenizer over bytes. Returns `folder`."""
-    from transformers import (
-        CLIPSegConfig,
-        CLIPSegForImageSegmentation,
-        CLIPSegProcessor,
-        ViTImageProcessor,
-    )
+    from transformers import CLIPSegConfig, CLIPSegForImageSegmentation, CLIPSegProcessor, ViTImageProcessor
 
     tokenizer = byte_tokenizer()
     config = CLIPSegConfig(

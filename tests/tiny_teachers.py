@@ -99,12 +99,7 @@ def make_tiny_altclip(folder: Path, side: int = 32, patch: int = 8, seed: int = 
 def make_tiny_sam3(folder: Path, side: int = 56, seed: int = 0) -> Path:
     """As facebook/sam3: the detector inside a video model's configuration and weights."""
     from safetensors.torch import load_file, save_file
-    from transformers import (
-        Sam3Config,
-        Sam3ImageProcessor,
-        Sam3Model,
-        Sam3Processor,
-    )
+    from transformers import Sam3Config, Sam3ImageProcessor, Sam3Model, Sam3Processor
 
     width = {"hidden_size": 32, "intermediate_size": 64, "num_attention_heads": 2}
     layers = {**width, "num_layers": 2}

@@ -13,11 +13,7 @@ from lab.benchmarks.ablation_rows import BOUNDS, FULL, Row
 from lab.benchmarks.scored_runs import Run
 from lab.reports import as_png
 from lang3dxl_ns.common.files import write_atomically
-from lang3dxl_ns.common.reports import (
-    describe_machine,
-    markdown_table,
-    write_report,
-)
+from lang3dxl_ns.common.reports import describe_machine, markdown_table, write_report
 
 FIGURES = {
     "test_map": ("mAP, test views", ".3f"),

@@ -44,14 +44,7 @@ _LIBRARIES = ("lang3dxl_ns.plugin.trainer_config", "lang3dxl_ns.methods")
 """Modules that a run's process imports. They are preloaded because the imports take ten seconds."""
 _TIMED_PHOTOS = 3
 _UNWANTED = ("num_rays_per_sec", "fps")
-_BESIDE = (
-    "map",
-    "raw_map",
-    "localization_accuracy",
-    "cc_psnr",
-    "clip_l1",
-    "clip_cosine",
-)
+_BESIDE = ("map", "raw_map", "localization_accuracy", "cc_psnr", "clip_l1", "clip_cosine")
 """Figures kept of test views and seen photos, besides every category's average precision."""
 
 
@@ -427,10 +420,7 @@ def _pictures(run: Run, data: TrainingData) -> Iterator[tuple[str, GroundTruth, 
 
 
 def _score_pictures(
-    prefix: str,
-    scorer: MapScorer,
-    photos: Sequence[Photo],
-    maps_of: Callable[[Photo, tuple[int, int]], Maps],
+    prefix: str, scorer: MapScorer, photos: Sequence[Photo], maps_of: Callable[[Photo, tuple[int, int]], Maps]
 ) -> dict[str, float]:
     """Compute the mean figures of photos. `maps_of` makes a photo's maps at a given size."""
     from lang3dxl_ns.evaluation.aggregate import average

@@ -67,11 +67,7 @@ def _relevancy_maps(
     """Relevancy at half the view's size."""
     photo = torch.from_numpy(view[COLOR].transpose(1, 2, 0).astype(np.float32) / 255)
     target = build_clip_target(
-        encoder.in_known_light(photo),
-        sides,
-        encoder.encode_images,
-        encoder.crop_size,
-        256,
+        encoder.in_known_light(photo), sides, encoder.encode_images, encoder.crop_size, 256
     )
     half = (view.shape[1] // 2, view.shape[2] // 2)
     features = F.interpolate(target.features.permute(2, 0, 1)[None], half, mode="bilinear")[0]

@@ -24,20 +24,8 @@ from jaxtyping import Float, Int
 from numpy import ndarray as Array
 from torch import Tensor, nn
 
-from lab.clip_training.captions import (
-    ABSENT,
-    CLASSES,
-    GENERIC,
-    Caption,
-    draw_caption,
-)
-from lab.clip_training.contrastive import (
-    GENERIC_SHARE,
-    caption_fit,
-    contrastive_loss,
-    in_doubt,
-    patch_loss,
-)
+from lab.clip_training.captions import ABSENT, CLASSES, GENERIC, Caption, draw_caption
+from lab.clip_training.contrastive import GENERIC_SHARE, caption_fit, contrastive_loss, in_doubt, patch_loss
 from lab.clip_training.crops import (
     Crops,
     augment,

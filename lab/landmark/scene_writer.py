@@ -25,23 +25,9 @@ from lab.landmark.demo_scene import CAMERAS, FOLDER, DemoScene
 from lab.landmark.labels import CATEGORIES, SMALLEST_POSITIVE, building_mask, category_masks
 from lab.landmark.landmark import Landmark
 from lab.landmark.novel_cameras import choose_cameras
-from lab.landmark.photography import (
-    Shot,
-    View,
-    plain_view,
-    random_photo_size,
-    random_view,
-    take_photo,
-)
+from lab.landmark.photography import Shot, View, plain_view, random_photo_size, random_view, take_photo
 from lab.landmark.raycast import Camera
-from lab.landmark.sparse_model import (
-    POINTS,
-    Similarity,
-    TakenPhoto,
-    find_tracks,
-    sample_points,
-    write_model,
-)
+from lab.landmark.sparse_model import POINTS, Similarity, TakenPhoto, find_tracks, sample_points, write_model
 from lang3dxl_ns.common.console import tracked
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import expanded

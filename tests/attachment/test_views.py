@@ -10,14 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from lang3dxl_ns.attachment import direction_of, views
 from lang3dxl_ns.attachment.upright import Upright
-from lang3dxl_ns.attachment.views import (
-    LENS,
-    Extent,
-    candidates,
-    looking,
-    rendered_views,
-    solids,
-)
+from lang3dxl_ns.attachment.views import LENS, Extent, candidates, looking, rendered_views, solids
 from lang3dxl_ns.common.errors import UserError
 
 SPLATS = box_splat(0.1, ground=True)

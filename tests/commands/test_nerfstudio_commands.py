@@ -64,14 +64,8 @@ def test_resume(run, scene, tiny_clip, tiny_dense, folder):
     output = command(
         *("ns-train", "lang3dxl", "--data", scene, "--max-num-iterations", 12, "--vis", "tensorboard"),
         *("--pipeline.datamanager.clip", tiny_clip, "--pipeline.datamanager.dense", tiny_dense, *FEW),
-        *(
-            "--output-dir",
-            folder / "outputs",
-            "--timestamp",
-            "second",
-            "--load-dir",
-            run / "nerfstudio_models",
-        ),
+        *("--output-dir", folder / "outputs", "--timestamp", "second"),
+        *("--load-dir", run / "nerfstudio_models"),
         cwd=folder,
     )
     assert "Resuming at iteration 8 of 12" in output
@@ -113,42 +107,19 @@ def test_render_shows_what_is_asked_for(run, folder, camera_path, monkeypatch, v
 
 
 def test_export_splat(run, folder):
-    words = (
-        "ns-export",
-        "gaussian-splat",
-        "--load-config",
-        run / "config.yml",
-        "--output-dir",
-        folder / "ply",
-    )
-    command(*words, cwd=folder)
+    words = ("ns-export", "gaussian-splat", "--load-config", run / "config.yml", "--output-dir")
+    command(*words, folder / "ply", cwd=folder)
     header = (folder / "ply" / "splat.ply").read_bytes()[:2000]
     assert header.startswith(b"ply")
     assert b"f_dc_0" in header
 
 
-def test_transforms_json_scenes_train_too(scene, tiny_clip, tiny_dense, folder):
-    """As LERF-OVS and DL3DV scenes come: no tracks, so sizes come from the seed points."""
-    data = transforms_scene(scene, folder / "transforms_scene")
-    output = command(
-        *("ns-train", "lang3dxl", "--data", data, "--max-num-iterations", 5, "--vis", "tensorboard"),
-        *("--pipeline.datamanager.clip", tiny_clip, "--pipeline.datamanager.dense", tiny_dense, *FEW),
-        *("--output-dir", folder / "outputs"),
-        cwd=folder,
-    )
-    assert "crop sides" in output
-
-
-def test_transforms_json_without_points_takes_relative_crops(scene, tiny_clip, tiny_dense, folder):
-    data = transforms_scene(scene, folder / "no_points", points=False)
-    output = command(
-        *("ns-train", "lang3dxl", "--data", data, "--max-num-iterations", 3, "--vis", "tensorboard"),
-        *("--pipeline.datamanager.clip", tiny_clip, "--pipeline.datamanager.dense", tiny_dense, *FEW),
-        *("--pipeline.model.random-init", "True", "--pipeline.model.num-random", 200),
-        *("--output-dir", folder / "outputs"),
-        cwd=folder,
-    )
-    assert "no 3D points" in output
+@pytest.mark.parametrize(("points", "said"), [(True, "crop sides"), (False, "no 3D points")])
+def test_transforms_json_scenes_train_too(scene, train, tmp_path, capsys, points, said):
+    """As LERF-OVS and DL3DV scenes come, without tracks: sizes come from the seed points, or are relative."""
+    data = transforms_scene(scene, tmp_path / "transforms_scene", points)
+    train(data, 3, pipeline__model__random_init=not points, pipeline__model__num_random=200)
+    assert said in " ".join(capsys.readouterr().out.split())
 
 
 def test_a_mistake_is_one_sentence_without_traceback(folder):
@@ -173,16 +144,9 @@ def transforms_scene(scene: Path, target: Path, points: bool = True) -> Path:
     for g in reconstruction.photos.values():
         pose = np.linalg.inv(np.vstack([g.camera_from_world, [0, 0, 0, 1]]))
         pose[:3, 1:3] *= -1
-        lens = g.lens
-        intrinsics = {
-            "fl_x": lens.fx,
-            "fl_y": lens.fy,
-            "cx": lens.cx,
-            "cy": lens.cy,
-            "w": g.width,
-            "h": g.height,
-        }
-        frames.append({"file_path": f"images/{g.name}", "transform_matrix": pose.tolist(), **intrinsics})
+        lens = {"fl_x": g.lens.fx, "fl_y": g.lens.fy, "cx": g.lens.cx, "cy": g.lens.cy}
+        frame = {"file_path": f"images/{g.name}", "transform_matrix": pose.tolist(), **lens}
+        frames.append(frame | {"w": g.width, "h": g.height})
     meta = {"camera_model": "OPENCV", "frames": frames}
     if points:
         meta["ply_file_path"] = "points.ply"

@@ -12,11 +12,7 @@ import torch
 from numpy import ndarray as Array
 
 from lab.numerics.measure import Bounds, Case, Problem
-from lang3dxl_ns.preparation.physical_scale import (
-    crop_sides,
-    physical_scales,
-    pixel_size,
-)
+from lang3dxl_ns.preparation.physical_scale import crop_sides, physical_scales, pixel_size
 from lang3dxl_ns.preparation.settings import AngleRule, DistanceRule
 from lang3dxl_ns.scene.camera import Lens
 from lang3dxl_ns.scene.colmap import TrackedPhoto

@@ -5,11 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from lang3dxl_ns.training.learning_rates import (
-    cosine_decay,
-    log_linear,
-    semantic_ramp,
-)
+from lang3dxl_ns.training.learning_rates import cosine_decay, log_linear, semantic_ramp
 
 X = [i / 100 for i in range(101)]
 

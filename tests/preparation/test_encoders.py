@@ -11,12 +11,7 @@ from tiny_models import make_tiny_clip, make_tiny_dinov2
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.preparation.encoders import load_dense_encoder, load_image_text_encoder
-from lang3dxl_ns.preparation.model_files import (
-    USUAL_CLIP,
-    check_encoders,
-    find_model,
-    usual_clip,
-)
+from lang3dxl_ns.preparation.model_files import USUAL_CLIP, check_encoders, find_model, usual_clip
 from lang3dxl_ns.preparation.settings import PreparationConfig
 from lang3dxl_ns.training.batches import settle
 

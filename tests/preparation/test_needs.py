@@ -173,10 +173,7 @@ def test_a_checkpoint_brings_what_it_was_trained_with(train, scene):
     from nerfstudio.utils.eval_utils import eval_setup
 
     trainer = train(
-        scene,
-        iterations=3,
-        pipeline__model__view_dependence="off",
-        pipeline__model__camera_optimization="on",
+        scene, iterations=3, pipeline__model__view_dependence="off", pipeline__model__camera_optimization="on"
     )
     _, pipeline, _, _ = eval_setup(trainer.base_dir / "config.yml", test_mode="test")
     assert pipeline.model.config.sh_degree == 0

@@ -4,12 +4,7 @@ import torch
 import torch.nn.functional as F
 from PIL import Image
 
-from lang3dxl_ns.preparation.pyramid import (
-    build_clip_target,
-    crop_centers,
-    iterate_crops,
-    valid_fractions,
-)
+from lang3dxl_ns.preparation.pyramid import build_clip_target, crop_centers, iterate_crops, valid_fractions
 
 
 def cut_crops(photo, side, size, steps=2):

@@ -4,14 +4,7 @@ import pytest
 import torch
 
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.query.text import (
-    Prompt,
-    TextConfig,
-    TextEncoder,
-    caution,
-    listed_phrases,
-    parse_prompts,
-)
+from lang3dxl_ns.query.text import Prompt, TextConfig, TextEncoder, caution, listed_phrases, parse_prompts
 from lang3dxl_ns.query.vocabulary import (
     common_words,
     searched,

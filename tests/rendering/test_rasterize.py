@@ -13,11 +13,7 @@ from lang3dxl_ns.rendering import rasterize
 from lang3dxl_ns.rendering.rasterize import at_fewer_pixels
 
 pytestmark = pytest.mark.usefixtures("backend")
-MODES = [
-    {},
-    {"antialiased": True},
-    {"near": 1.5, "eps2d": 0.1},
-]
+MODES = [{}, {"antialiased": True}, {"near": 1.5, "eps2d": 0.1}]
 
 
 def check_float32(cloud: Cloud):

@@ -538,11 +538,7 @@ def test_a_capture_without_its_lost_photo_is_the_others_alone(folder, capsys):
 
 @pytest.mark.parametrize(
     ("settings", "held_out"),
-    [
-        ({}, [0]),
-        ({"eval_interval": 2}, [0, 2, 4]),
-        ({"eval_mode": "all"}, [0, 1, 2, 3, 4, 5]),
-    ],
+    [({}, [0]), ({"eval_interval": 2}, [0, 2, 4]), ({"eval_mode": "all"}, [0, 1, 2, 3, 4, 5])],
 )
 def test_the_split_follows_the_rule(folder, settings, held_out):
     split = open_capture(folder, CaptureSettings(**settings)).split

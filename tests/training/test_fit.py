@@ -1,9 +1,12 @@
 """`fit`: the same bytes as `ns-train`, also after a stop; what a run leaves in its folder."""
 
+import io
 import os
 import re
 import signal
+from contextlib import redirect_stdout
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -27,7 +30,7 @@ def data(tmp_path_factory) -> Path:
     return write_scene(tmp_path_factory.mktemp("data") / "scene", photos=6, points=100)
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def settings(tiny_clip, tiny_dense):
     def make(steps: int = STEPS, **changes) -> Settings:
         made = Settings.of("lang3dxl", steps)
@@ -47,6 +50,21 @@ def trained(data: Path, out: Path, settings: Settings) -> dict:
     return torch.load(out / CHECKPOINT, weights_only=True)["tensors"]
 
 
+@pytest.fixture(scope="module")
+def whole(data, settings, tmp_path_factory) -> dict:
+    """The checkpoint of a run without interruption."""
+    return trained(data, tmp_path_factory.mktemp("whole"), settings())
+
+
+@pytest.fixture(scope="module")
+def short(data, settings, tmp_path_factory) -> SimpleNamespace:
+    """Folder, checkpoint and output of a finished run of four iterations."""
+    out = tmp_path_factory.mktemp("short")
+    with redirect_stdout(io.StringIO()) as said:
+        tensors = trained(data, out, settings(4))
+    return SimpleNamespace(out=out, tensors=tensors, said=said.getvalue())
+
+
 def differing(first: dict, second: dict) -> list[str]:
     assert first.keys() == second.keys()
     return [
@@ -59,18 +77,16 @@ def differing(first: dict, second: dict) -> list[str]:
     ]
 
 
-def test_nerfstudio_trains_the_same_bytes(data, settings, train, tmp_path):
-    mine = trained(data, tmp_path / "mine", settings())
+def test_nerfstudio_trains_the_same_bytes(data, whole, train):
     changes = {f"pipeline__model__{name}": value for name, value in GROWING.items()}
     theirs = train(data, STEPS, steps_per_eval_image=0, **changes).pipeline.model.state_dict()
     theirs.pop("device_indicator_param")
-    assert len(mine["gauss_params.means"]) > 600 and "gauss_params.codes" in mine
-    assert differing(mine, dict(theirs)) == []
+    assert len(whole["gauss_params.means"]) > 600 and "gauss_params.codes" in whole
+    assert differing(whole, dict(theirs)) == []
 
 
-def test_a_run_that_was_stopped_ends_with_the_same_bytes(data, settings, tmp_path, monkeypatch):
+def test_a_run_that_was_stopped_ends_with_the_same_bytes(data, settings, whole, tmp_path, monkeypatch):
     """By Ctrl-C within an iteration, and by being killed between two checkpoints."""
-    whole = trained(data, tmp_path / "whole", settings())
     iterate = Run.iterate
 
     def interrupted(self, step):
@@ -91,9 +107,9 @@ def test_a_run_that_was_stopped_ends_with_the_same_bytes(data, settings, tmp_pat
 
 
 def test_words_that_are_stopped_are_said_and_made_by_the_next_command(
-    data, settings, tmp_path, monkeypatch, capsys
+    data, settings, short, tmp_path, monkeypatch, capsys
 ):
-    whole, learn = trained(data, tmp_path / "whole", settings(4)), fitting.learn_words
+    learn = fitting.learn_words
 
     def stopped(*arguments):
         signal.raise_signal(signal.SIGINT)
@@ -104,7 +120,7 @@ def test_words_that_are_stopped_are_said_and_made_by_the_next_command(
         trained(data, tmp_path / "again", settings(4))
     assert "Stopped while words were learned; all iterations are kept" in capsys.readouterr().out
     monkeypatch.setattr(fitting, "learn_words", learn)
-    assert differing(whole, trained(data, tmp_path / "again", settings(4))) == []
+    assert differing(short.tensors, trained(data, tmp_path / "again", settings(4))) == []
 
 
 def test_a_full_memory_names_settings_that_help_and_the_checkpoint(data, settings, tmp_path, monkeypatch):
@@ -124,13 +140,9 @@ def test_a_full_memory_names_settings_that_help_and_the_checkpoint(data, setting
         trained(data, tmp_path, settings(4))
 
 
-def test_the_time_is_estimated_before_and_the_number_of_gaussians_is_no_noise(
-    data, settings, tmp_path, capsys
-):
-    trained(data, tmp_path, settings())
-    said = capsys.readouterr().out
-    assert re.search(r"training: about \d+ seconds for 20 iterations, then about .* to learn words", said)
-    assert "→" not in said
+def test_the_time_is_estimated_before_and_the_number_of_gaussians_is_no_noise(short):
+    time = r"training: about \d+ seconds for 4 iterations, then about .* to learn words"
+    assert re.search(time, short.said) and "→" not in short.said
 
 
 def test_a_scene_of_a_resumed_run_has_all_its_colors(data, settings, tmp_path):
@@ -143,15 +155,12 @@ def test_a_scene_of_a_resumed_run_has_all_its_colors(data, settings, tmp_path):
     assert torch.equal(whole.splats.harmonics, again.splats.harmonics)
 
 
-def test_a_finished_run_is_not_trained_again_and_another_one_is_refused(
-    data, settings, tmp_path, monkeypatch
-):
-    trained(data, tmp_path, settings(4))
+def test_a_finished_run_is_not_trained_again_and_another_one_is_refused(data, settings, short, monkeypatch):
     monkeypatch.setattr(fitting, "render", lambda *_: pytest.fail("trained again"))
     monkeypatch.setattr(fitting, "learn_words", lambda *_: pytest.fail("learned again"))
-    trained(data, tmp_path, settings(4))
+    trained(data, short.out, settings(4))
     with pytest.raises(UserError, match="holds a run with another steps"):
-        trained(data, tmp_path, settings(5))
+        trained(data, short.out, settings(5))
 
 
 def test_mixed_precision_without_such_a_gpu_is_refused_before_anything_is_prepared(data, settings, tmp_path):
