@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any
 from unittest import mock
 
-_SERVER = multiprocessing.get_context("forkserver")
+SERVER = multiprocessing.get_context("forkserver")
 _LIBRARIES = [
     "numpy",  # before pycolmap
     "lang3dxl_ns.cli",
@@ -74,7 +74,7 @@ class Process:
         self._folder = tempfile.TemporaryDirectory()
         environment = {**os.environ, "HF_HUB_OFFLINE": "1", "COLUMNS": "200"}
         place = (self._folder.name, str(cwd or os.getcwd()), environment, new_session)
-        self._process = _SERVER.Process(target=_within, args=(place, function, arguments))
+        self._process = SERVER.Process(target=_within, args=(place, function, arguments))
         self._process.start()
         assert self._process.pid is not None
         self.pid: int = self._process.pid

@@ -53,7 +53,7 @@ def test_two_commands_on_one_folder_do_no_harm_and_one_that_is_killed_loses_noth
 
 
 @pytest.mark.slow
-def test_several_workers_make_what_one_makes(tmp_path, clip):
+def test_several_workers_make_what_one_makes(tmp_path, clip, forked_workers):
     for i in range(6):
         write_photo(tmp_path, f"{i}.png", i)
     one = prepare(tmp_path, clip, 1, "local")

@@ -15,7 +15,7 @@ def processes(folder):
 
 
 @pytest.mark.parametrize("count", [1, 2])
-def test_every_item_comes_back_with_its_result(tmp_path, count):
+def test_every_item_comes_back_with_its_result(tmp_path, forked_workers, count):
     found = dict(run(PreparationConfig(workers=count), Squares(tmp_path).start, range(12), "cpu"))
     assert found == {item: item**2 for item in range(12)}
     assert len(list(tmp_path.glob("*.*"))) == 12
