@@ -5,6 +5,7 @@ from scenes import write_scene
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -182,3 +183,35 @@ def view_of(camera):
     (fx, _, cx), (_, fy, cy), _ = camera.intrinsics.tolist()
     lens = Lens(camera.width, camera.height, fx, fy, cx, cy)
     return to_nerfstudio([lens], camera_to_world(camera.view_matrix.cpu())[None])
+
+
+def write_ply(path, form, kinds, rows, colors=("red", "green", "blue")):
+    """Write points as a PLY of a form ("ascii", "binary_little_endian" …), with columns of these kinds."""
+    names = ["x", "y", "z", *colors][: len(rows[0])]
+    words = {"f4": "float", "f8": "double", "u1": "uchar", "u2": "ushort"}
+    head = f"ply\nformat {form} 1.0\nelement vertex {len(rows)}\n"
+    head += "".join(f"property {words[k]} {n}\n" for k, n in zip(kinds, names, strict=True)) + "end_header\n"
+    order = ">" if "big" in form else "<"
+    table = np.array([tuple(r) for r in rows], [(n, order + k) for n, k in zip(names, kinds, strict=True)])
+    body = "\n".join(" ".join(map(str, r)) for r in rows).encode() if form == "ascii" else table.tobytes()
+    path.write_bytes(head.encode() + body)
+    return path
+
+
+def write_transforms(folder, names=None, scale=1.0, **top):
+    """Write a scene, of photos of one size, as transforms.json too, and return its COLMAP model."""
+    from lang3dxl_ns.scene.colmap import read_reconstruction
+
+    model = read_reconstruction(folder / "sparse" / "0")
+    frames = []
+    for name, photo in model.photos.items():
+        pose = np.linalg.inv(np.vstack([photo.camera_from_world, [0, 0, 0, 1]]))
+        pose[:3, 1:3] *= -1
+        pose[:3, :3] *= scale
+        frames.append({"file_path": f"images/{name}", "transform_matrix": pose.tolist()})
+    lens = next(iter(model.photos.values())).lens
+    content = {"w": 96, "h": 72, "fl_x": lens.fx, "fl_y": lens.fy, "cx": lens.cx, "cy": lens.cy}
+    for frame, name in zip(frames, names or (), strict=False):
+        frame["file_path"] = name
+    (folder / "transforms.json").write_text(json.dumps(content | top | {"frames": frames}))
+    return model

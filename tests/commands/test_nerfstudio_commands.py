@@ -4,14 +4,14 @@ A shell starts `ns-train`; the others import what it does, and find the method a
 """
 
 import json
-import os
+import shutil
 from pathlib import Path
 
 import pytest
 from PIL import Image
 from processes import output as command
 from processes import run as attempt
-from scenes import write_scene
+from scenes import write_ply, write_scene, write_transforms
 
 pytestmark = [pytest.mark.slow, pytest.mark.nerfstudio]
 FEW = (
@@ -115,9 +115,12 @@ def test_export_splat(run, folder):
 
 
 @pytest.mark.parametrize(("points", "said"), [(True, "crop sides"), (False, "no 3D points")])
-def test_transforms_json_scenes_train_too(scene, train, tmp_path, capsys, points, said):
+def test_transforms_json_scenes_train_too(train, tmp_path, capsys, points, said):
     """As LERF-OVS and DL3DV scenes come, without tracks: sizes come from the seed points, or are relative."""
-    data = transforms_scene(scene, tmp_path / "transforms_scene", points)
+    data = write_scene(tmp_path / "scene", photos=5, points=100)
+    model = write_transforms(data, **({"ply_file_path": "points.ply"} if points else {}))
+    write_ply(data / "points.ply", "ascii", ["f4"] * 3, model.points.tolist())
+    shutil.rmtree(data / "sparse")
     train(data, 3, pipeline__model__random_init=not points, pipeline__model__num_random=200)
     assert said in " ".join(capsys.readouterr().out.split())
 
@@ -129,31 +132,3 @@ def test_a_mistake_is_one_sentence_without_traceback(folder):
     assert done.returncode == 1
     assert "nowhere is not a folder" in done.stdout
     assert "Traceback" not in done.stdout + done.stderr
-
-
-def transforms_scene(scene: Path, target: Path, points: bool = True) -> Path:
-    """The COLMAP scene rewritten as nerfstudio's transforms.json."""
-    import numpy as np
-
-    from lang3dxl_ns.scene.colmap import read_reconstruction
-
-    reconstruction = read_reconstruction(scene / "sparse" / "0")
-    target.mkdir()
-    os.symlink(scene / "images", target / "images")
-    frames = []
-    for g in reconstruction.photos.values():
-        pose = np.linalg.inv(np.vstack([g.camera_from_world, [0, 0, 0, 1]]))
-        pose[:3, 1:3] *= -1
-        lens = {"fl_x": g.lens.fx, "fl_y": g.lens.fy, "cx": g.lens.cx, "cy": g.lens.cy}
-        frame = {"file_path": f"images/{g.name}", "transform_matrix": pose.tolist(), **lens}
-        frames.append(frame | {"w": g.width, "h": g.height})
-    meta = {"camera_model": "OPENCV", "frames": frames}
-    if points:
-        meta["ply_file_path"] = "points.ply"
-        lines = [f"{x} {y} {z} 128 128 128" for x, y, z in reconstruction.points]
-        header = f"ply\nformat ascii 1.0\nelement vertex {len(lines)}\n"
-        header += "".join(f"property float {a}\n" for a in "xyz")
-        header += "".join(f"property uchar {c}\n" for c in ("red", "green", "blue")) + "end_header\n"
-        (target / "points.ply").write_text(header + "\n".join(lines) + "\n")
-    (target / "transforms.json").write_text(json.dumps(meta))
-    return target

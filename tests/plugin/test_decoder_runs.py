@@ -116,11 +116,3 @@ def test_without_the_downsampler_codes_learn_all_the_same(train, scene, match):
     )
     assert trainer.pipeline.model.gauss_params["codes"].grad.abs().max() > 0
     assert trainer.pipeline.model.downsampler.network is None
-
-
-def test_crops_of_one_size_are_the_middle_of_the_range(train, scene, tmp_path):
-    options = {"scale_mode": "relative", "scale_range": (0.4, 0.9), "scales": 1}
-    options |= {"cache_dir": tmp_path / "targets", "crops": "pyramid"}
-    trainer = train(scene, iterations=2, **{f"pipeline__datamanager__{k}": v for k, v in options.items()})
-    _, batch = next(trainer.pipeline.datamanager.data.every_photo())
-    assert batch["crop_sides"] == [pytest.approx(0.6, abs=0.02)]

@@ -1,14 +1,13 @@
 """Captures as other programs leave them: each right value, from formulas."""
 
 import base64
-import json
 import struct
 import zlib
 
 import numpy as np
 import pytest
 from PIL import Image, PngImagePlugin
-from scenes import write_scene
+from scenes import write_ply, write_scene, write_transforms
 from scipy.spatial.transform import Rotation
 
 from lang3dxl_ns.common.errors import UserError
@@ -344,29 +343,17 @@ def test_pictures_that_are_never_read_are_named_with_the_way_out(tmp_path, name)
 # ── points ──────────────────────────────────────────────────────────────────────────────────────────────
 
 
-def ply(path, form, kinds, rows, colors=("red", "green", "blue")):
-    names = ["x", "y", "z", *colors][: len(rows[0])]
-    words = {"f4": "float", "f8": "double", "u1": "uchar", "u2": "ushort"}
-    head = f"ply\nformat {form} 1.0\nelement vertex {len(rows)}\n"
-    head += "".join(f"property {words[k]} {n}\n" for k, n in zip(kinds, names, strict=True)) + "end_header\n"
-    order = ">" if "big" in form else "<"
-    table = np.array([tuple(r) for r in rows], [(n, order + k) for n, k in zip(names, kinds, strict=True)])
-    body = "\n".join(" ".join(map(str, r)) for r in rows).encode() if form == "ascii" else table.tobytes()
-    path.write_bytes(head.encode() + body)
-    return path
-
-
 @pytest.mark.parametrize("form", ["ascii", "binary_little_endian", "binary_big_endian"])
 @pytest.mark.parametrize(("kind", "full"), [("u1", 255), ("u2", 65535), ("f4", 1.0), ("f4", 255.0)])
 def test_points_of_every_form_have_their_colors(tmp_path, form, kind, full):
     rows = [(1.5, 2, 3, full, 0, full), (4, 5, 6, 0, full, 0)]
-    points, colors = read_ply_points(ply(tmp_path / "a.ply", form, ["f8"] * 3 + [kind] * 3, rows))
+    points, colors = read_ply_points(write_ply(tmp_path / "a.ply", form, ["f8"] * 3 + [kind] * 3, rows))
     assert points.tolist() == [[1.5, 2, 3], [4, 5, 6]]
     assert colors.tolist() == [[255, 0, 255], [0, 255, 0]]
 
 
 def test_points_without_colors_are_gray(tmp_path, capsys):
-    _, colors = read_ply_points(ply(tmp_path / "a.ply", "ascii", ["f4"] * 3, [(1.0, 2, 3)]))
+    _, colors = read_ply_points(write_ply(tmp_path / "a.ply", "ascii", ["f4"] * 3, [(1.0, 2, 3)]))
     assert colors.tolist() == [[128, 128, 128]] and "no colors" in capsys.readouterr().out
 
 
@@ -383,26 +370,10 @@ def test_damaged_points_are_named(tmp_path, content):
 # ── transforms.json ─────────────────────────────────────────────────────────────────────────────────────
 
 
-def write_transforms(folder, names=None, scale=1.0, **top):
-    model = read_reconstruction(folder / "sparse" / "0")
-    frames = []
-    for name, photo in model.photos.items():
-        pose = np.linalg.inv(np.vstack([photo.camera_from_world, [0, 0, 0, 1]]))
-        pose[:3, 1:3] *= -1
-        pose[:3, :3] *= scale
-        frames.append({"file_path": f"images/{name}", "transform_matrix": pose.tolist()})
-    lens = next(iter(model.photos.values())).lens
-    content = {"w": 96, "h": 72, "fl_x": lens.fx, "fl_y": lens.fy, "cx": lens.cx, "cy": lens.cy}
-    for frame, name in zip(frames, names or (), strict=False):
-        frame["file_path"] = name
-    (folder / "transforms.json").write_text(json.dumps(content | top | {"frames": frames}))
-    return model
-
-
 def test_transforms_and_model_are_one_capture(folder):
     model = open_capture(folder)
     points = [(*p, *c) for p, c in zip(model.reconstruction.points, model.reconstruction.colors, strict=True)]
-    ply(folder / "points.ply", "binary_little_endian", ["f8"] * 3 + ["u1"] * 3, points)
+    write_ply(folder / "points.ply", "binary_little_endian", ["f8"] * 3 + ["u1"] * 3, points)
     write_transforms(folder, ply_file_path="points.ply", scale=1.5)
     found = open_capture(folder / "transforms.json")
     for a, b in zip(model.reconstruction.photos.values(), found.reconstruction.photos.values(), strict=True):

@@ -130,7 +130,7 @@ def test_learning_rates_a_million_apart_end_in_finite_parameters(train, scene):
     config = trainer.config
     config.optimizers["scales"]["optimizer"].lr = 50.0
     config.optimizers["quats"]["optimizer"].lr = 1e-6
-    config.max_num_iterations = 30
+    config.max_num_iterations = 15
     again = config.setup(local_rank=0, world_size=1)
     again.setup()
     again.train()
