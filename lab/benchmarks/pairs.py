@@ -1,16 +1,18 @@
-"""Recall of the pairs that `reconstruct` matches in a large collection, whose true model is known.
+"""How many of the true pairs of photos `reconstruct` tries and verifies, where the true model is known.
 
     lang3dxl demo-scene --family cathedral --seed 601 --photos 1000 --weathered --out TRUE
-    python -m lab.benchmarks.pairs --true TRUE --work DIR
+    mkdir FOUND && cp -r TRUE/images FOUND && lang3dxl reconstruct --data FOUND
+    python -m lab.benchmarks.pairs --true TRUE --found FOUND
 
 A true pair shares at least 15 % of the points of the photo with fewer, seen less than 30° apart.
 """
 
 from __future__ import annotations
 
+import sqlite3
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from time import process_time
 
 import numpy as np
 import pycolmap
@@ -19,10 +21,8 @@ from jaxtyping import Bool
 from numpy import ndarray as Array
 from scipy.sparse import csr_matrix
 
-from lang3dxl_ns.scene.matching import extract, feature_database, largest, numbered, quiet
-from lang3dxl_ns.scene.pairing import similar_pairs
-from lang3dxl_ns.scene.photo_folder import find_photos
-from lang3dxl_ns.scene.reconstruction import ReconstructionSettings
+from lang3dxl_ns.common.files import read_json
+from lang3dxl_ns.scene.placements import LEAST_MATCHES
 
 SHARED, TURNED = 0.15, 30.0
 PARTNERS = 3
@@ -31,13 +31,12 @@ PARTNERS = 3
 
 @dataclass
 class Pairs:
-    """Count the true pairs among those that are matched."""
+    """Count the true pairs among those that were tried."""
 
     true: Path
     """Scene of `lang3dxl demo-scene`."""
-    work: Path
-    """Folder for the features."""
-    neighbors: tuple[int, ...] = (10, 20, 40, 80)
+    found: Path
+    """Folder with some or all of its photos, reconstructed."""
 
 
 def true_pairs(model: pycolmap.Reconstruction, names: list[str]) -> Bool[Array, "n n"]:
@@ -53,29 +52,31 @@ def true_pairs(model: pycolmap.Reconstruction, names: list[str]) -> Bool[Array, 
     return (seen @ seen.T).toarray() * near * (1 - np.eye(len(names))) > SHARED * fewer
 
 
+def matched_pairs(database: Path) -> tuple[Bool[Array, "n n"], Bool[Array, "n n"]]:
+    """Tell which pairs were tried, and which of them were verified, by the photos' numbers in a database."""
+    with closing(sqlite3.connect(f"file:{database}?mode=ro", uri=True)) as db:
+        number = {i: int(Path(name).stem) for i, name in db.execute("SELECT image_id, name FROM images")}
+        rows = db.execute("SELECT pair_id, rows FROM two_view_geometries").fetchall()
+    tried, verified = np.zeros((2, len(number), len(number)), bool)
+    for pair, count in rows:
+        one, other = (number[i] for i in pycolmap.pair_id_to_image_pair(pair))
+        tried[one, other] = tried[other, one] = True
+        verified[one, other] = verified[other, one] = count >= LEAST_MATCHES
+    return tried, verified
+
+
 def main(config: Pairs) -> None:
-    photos, settings = find_photos(config.true), ReconstructionSettings(features="sift")
-    config.work.mkdir(parents=True, exist_ok=True)
-    copies = numbered(photos, config.work)
-    with quiet():
-        database = feature_database(photos, copies, config.work, settings)
-        extract(database, copies, settings)
-    truth = true_pairs(pycolmap.Reconstruction(config.true / "sparse/0"), list(photos.names))
+    work = config.found / "lang3dxl_cache" / "reconstruction"
+    names = [name for name, *_ in read_json(work / "photos.json")["photos"]]
+    truth = true_pairs(pycolmap.Reconstruction(config.true / "sparse/0"), names)
     partners = truth.sum(1)
-    with pycolmap.Database.open(database) as db:
-        ids = {image.name: image.image_id for image in db.read_all_images()}
-        number = {name: i for i, name in enumerate(copies.names)}
-        for count in config.neighbors:
-            start = process_time()
-            pairs = similar_pairs(copies.names, lambda name: largest(db, ids[name]), count)
-            seconds, found = process_time() - start, np.zeros_like(truth)
-            for one, other in pairs:
-                found[number[one], number[other]] = found[number[other], number[one]] = True
-            lost = int(((found & truth).sum(1) < PARTNERS)[partners >= PARTNERS].sum())
-            print(
-                f"{count} neighbors: {len(pairs):,} pairs, {found[truth].mean():.3f} of the true ones; under "
-                f"{PARTNERS} of them for {lost} of {(partners >= PARTNERS).sum()} photos; {seconds:.0f} s"
-            )
+    print(f"{len(names)} photos, {truth.sum() // 2:,} true pairs")
+    for label, pairs in zip(("tried", "verified"), matched_pairs(work / "database.db"), strict=True):
+        lost = int(((pairs & truth).sum(1) < PARTNERS)[partners >= PARTNERS].sum())
+        print(
+            f"{label}: {pairs.sum() // 2:,} pairs, {pairs[truth].mean():.3f} of the true ones; under "
+            f"{PARTNERS} of them for {lost} of {(partners >= PARTNERS).sum()} photos"
+        )
 
 
 if __name__ == "__main__":

@@ -25,13 +25,12 @@ from lang3dxl_ns.common.console import progress
 from lang3dxl_ns.common.device import best_device
 from lang3dxl_ns.common.pictures import eight_bits, open_picture
 from lang3dxl_ns.scene.colmap import load_pycolmap
-from lang3dxl_ns.scene.pairing import NEIGHBORS
 
 ALIKE = 0.82
 """Cosine of mutual nearest descriptors from which they count as a possible match."""
 LEAST_ALIKE = 20
 """Possible matches from which a pair of photos is matched."""
-PARTNERS = 12
+PARTNERS, NEIGHBORS = 12, 40
 """Photos with the most possible matches that each photo is matched with at least."""
 KEPT = "xfeat"
 """Folder of descriptors, beside the database."""

@@ -26,7 +26,7 @@ from lang3dxl_ns.common.memory import machine_memory
 from lang3dxl_ns.common.pictures import open_picture
 from lang3dxl_ns.scene.colmap import load_pycolmap
 from lang3dxl_ns.scene.learned_features import LearnedMatcher, extract_learned
-from lang3dxl_ns.scene.pairing import pairs_to_match
+from lang3dxl_ns.scene.pairing import ROUNDS, pairs_that_share, pairs_to_match
 from lang3dxl_ns.scene.photo_folder import PhotoFolder, find_photos, readable, shared_cameras
 from lang3dxl_ns.scene.placements import LEAST_MATCHES
 from lang3dxl_ns.scene.reconstruction import ReconstructionSettings
@@ -142,15 +142,31 @@ def match(
     """Find and verify the matches of pairs that are missing in the database, only those with one of `new`
     where that is given."""
     new = set(names if new is None else new)
+    with load_pycolmap().Database.open(database) as db:
+        ids = {image.name: image.image_id for image in db.read_all_images()}
+        known = sorted(n for n in names if n in ids and db.num_keypoints_for_image(ids[n]))
+        learned = LearnedMatcher(database, known) if settings.features == "xfeat" else None
+        pairs = learned.pairs() if learned else pairs_to_match(known, lambda name: largest(db, ids[name]))
+    tried: set[tuple[str, str]] = set()
+    for _ in range(1 if learned else 1 + ROUNDS):
+        _match_pairs(database, [pair for pair in pairs if not new.isdisjoint(pair)], settings, learned)
+        tried.update(pairs)  # not what an interrupted attempt also tried: its rounds would be others
+        if not (pairs := pairs_that_share(known, tried, tried & _matched(database))):
+            break
+
+
+def _match_pairs(
+    database: Path,
+    pairs: Sequence[tuple[str, str]],
+    settings: ReconstructionSettings,
+    learned: LearnedMatcher | None,
+) -> None:
+    """Find and verify the matches of those pairs that the database doesn't have."""
     pycolmap = load_pycolmap()
     with pycolmap.Database.open(database) as db:
         ids = {image.name: image.image_id for image in db.read_all_images()}
-        known = [n for n in names if n in ids and db.num_keypoints_for_image(ids[n])]
-        learned = LearnedMatcher(database, known) if settings.features == "xfeat" else None
-        pairs = learned.pairs() if learned else pairs_to_match(known, lambda name: largest(db, ids[name]))
         has = db.exists_matches, db.exists_two_view_geometry
-        wanted = [pair for pair in pairs if not new.isdisjoint(pair)]
-        missing = [(a, b) for a, b in wanted if not all(there(ids[a], ids[b]) for there in has)]
+        missing = [(a, b) for a, b in pairs if not all(there(ids[a], ids[b]) for there in has)]
     guided = settings.features == "dsp-sift"
     options = pycolmap.FeatureMatchingOptions(num_threads=_threads(5e8), guided_matching=guided)
     listed = database.with_name("pairs.txt")
@@ -177,13 +193,21 @@ def largest(database: pycolmap.Database, number: int) -> UInt8[Array, "n 128"]:
 
 def features_and_partners(database: Path) -> tuple[dict[str, int], Counter[str]]:
     """Count, for every photo, its features and the photos with which it has verified matches."""
+    with load_pycolmap().Database.open(database) as db:
+        images = {image.name: image.image_id for image in db.read_all_images()}
+        features = {name: db.num_keypoints_for_image(number) for name, number in images.items()}
+    return features, Counter(name for pair in _matched(database) for name in pair)
+
+
+def _matched(database: Path) -> set[tuple[str, str]]:
+    """List the pairs of photos with verified matches, each in the order of names."""
     pycolmap = load_pycolmap()
     with pycolmap.Database.open(database) as db:
         images = {image.image_id: image.name for image in db.read_all_images()}
-        features = {name: db.num_keypoints_for_image(number) for number, name in images.items()}
         pairs, inliers = db.read_two_view_geometry_num_inliers()
     matched = (pair for pair, count in zip(pairs, inliers, strict=True) if count >= LEAST_MATCHES)
-    return features, Counter(images[i] for pair in matched for i in pycolmap.pair_id_to_image_pair(pair))
+    named = ([images[i] for i in pycolmap.pair_id_to_image_pair(pair)] for pair in matched)
+    return {(min(names), max(names)) for names in named}
 
 
 @contextmanager

@@ -1,69 +1,96 @@
-"""Photo pairs to match: all, or each photo with its most similar ones."""
+"""Photo pairs to match: all of a few photos; of more, those whose largest features seem to match, and then
+those that match the same others."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from itertools import combinations
 
 import numpy as np
-from jaxtyping import Float, UInt8
+import torch
+from jaxtyping import Float, Int, UInt8
 from numpy import ndarray as Array
+from torch import Tensor
 
-EXHAUSTIVE = 200
-"""Largest number of photos for which every pair is matched, which makes 19,900 pairs."""
-NEIGHBORS = 40
-"""Most similar photos with which each photo is paired in larger collections."""
-_WORDS, _PER_WORD = 512, 32
-"""Most visual words, and fewest features for each of them."""
-_PER_PHOTO = 500
-"""Features per photo that tell how it looks: the largest, which others see from afar too."""
-_TEACHERS = 200  # photos from whose features the words are learned
+from lang3dxl_ns.common.console import progress
+
+EXHAUSTIVE = 100
+"""Largest number of photos for which every pair is matched, which makes 4,950 pairs."""
+ALIKE, SHARING, ROUNDS = 20, 20, 2
+"""Most photos with which each is paired in larger collections: for its looks, and then, in so many rounds,
+for the partners that both have."""
+_PER_PHOTO = 300
+"""Features per photo that are compared: the largest, which others see from afar too."""
+_CLEARLY = 0.7
+"""How much nearer the nearest descriptor must be than the second, as a share of its distance (Lowe 2004)."""
+_AT_ONCE = 64  # photos compared with one
 
 Descriptors = Callable[[str], UInt8[Array, "n 128"]]
 """Function from a photo's name to the SIFT descriptors of its features, the largest first."""
 
 
 def pairs_to_match(names: Sequence[str], descriptors: Descriptors) -> list[tuple[str, str]]:
-    """List the pairs of photos that may overlap: all of them for up to `EXHAUSTIVE` photos. For more photos,
-    the pairs are those of `similar_pairs`, and neighbors in name order, which is the order of a video or a
-    walk."""
+    """List the pairs to begin with: all of up to `EXHAUSTIVE` photos; of more, those of `similar_pairs`, and
+    neighbors in name order, which is the order of a video or a walk."""
     if len(names) <= EXHAUSTIVE:
         return list(combinations(names, 2))
-    found = set(similar_pairs(names, descriptors, NEIGHBORS))
+    found = set(similar_pairs(names, descriptors, ALIKE))
     for apart in (1, 2, 4, 8):
         found.update(zip(names[:-apart], names[apart:], strict=True))
     return sorted(found)
 
 
 def similar_pairs(names: Sequence[str], descriptors: Descriptors, neighbors: int) -> list[tuple[str, str]]:
-    """Pair each photo with its `neighbors` nearest by aggregated descriptors (VLAD, Jégou et al. 2010)."""
-    from sklearn.cluster import MiniBatchKMeans
-    from sklearn.neighbors import NearestNeighbors
-
-    some = np.random.default_rng(0).permutation(len(names))[:_TEACHERS]
-    sample = np.concatenate([_rows(descriptors(names[i])) for i in some])
-    count = max(min(_WORDS, len(sample) // _PER_WORD), 1)
-    words = MiniBatchKMeans(count, random_state=0, n_init=3).fit(sample).cluster_centers_
-    vectors = np.stack([_aggregate(_rows(descriptors(name)), words) for name in names])
-    search = NearestNeighbors(n_neighbors=min(neighbors, len(names) - 1), metric="cosine").fit(vectors)
-    found = enumerate(search.kneighbors(return_distance=False))  # without the photo itself
-    return sorted({(names[min(i, j)], names[max(i, j)]) for i, others in found for j in others})
+    """Pair each photo with the `neighbors` photos in which most of its largest features have a match
+    (preemptive matching, Wu 2013)."""
+    rows = torch.stack([_rows(descriptors(name)) for name in names])
+    counts = np.zeros((len(names), len(names)), dtype=int)
+    with progress("photos compared", len(names)) as advance:
+        for i in range(len(names)):
+            counts[i, i + 1 :] = counts[i + 1 :, i] = _possible_matches(rows[i], rows[i + 1 :])
+            advance(1)
+    return _best_pairs(names, counts, neighbors)
 
 
-def _rows(descriptors: UInt8[Array, "n 128"]) -> Float[Array, "m 128"]:
-    """Convert the descriptors of the largest features to RootSIFT."""
-    rows = descriptors[:_PER_PHOTO].astype(np.float32)
-    return np.sqrt(rows / np.maximum(rows.sum(1, keepdims=True), 1e-9))
+def pairs_that_share(
+    names: Sequence[str], tried: Collection[tuple[str, str]], matched: Collection[tuple[str, str]]
+) -> list[tuple[str, str]]:
+    """Pair each photo with the `SHARING` photos that match most of those that it matches, without pairs that
+    were tried. `matched` are those of the tried pairs that match."""
+    number = {name: i for i, name in enumerate(names)}
+    done, matches = np.eye(len(names), dtype=bool), np.zeros((len(names), len(names)), np.float32)
+    for table, pairs in ((done, tried), (matches, matched)):
+        for one, other in pairs:
+            table[number[one], number[other]] = table[number[other], number[one]] = 1
+    return _best_pairs(names, (matches @ matches * ~done).astype(int), SHARING)
 
 
-def _aggregate(rows: Float[Array, "n 128"], words: Float[Array, "k 128"]) -> Float[Array, " d"]:
-    """Sum the descriptors' differences from their nearest words, as roots, so that what repeats counts less,
-    normalized per word and overall."""
-    if not len(rows):
-        return np.zeros(words.size, np.float32)
-    nearest = (np.square(words).sum(1) - 2 * rows @ words.T).argmin(1)
-    total = np.zeros_like(words)
-    np.add.at(total, nearest, rows - words[nearest])
-    total = np.sign(total) * np.sqrt(abs(total))
-    total /= np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-9)
-    return (total / max(np.linalg.norm(total), 1e-9)).ravel()
+def _best_pairs(names: Sequence[str], scores: Int[Array, "n n"], count: int) -> list[tuple[str, str]]:
+    """Pair each photo with the `count` of the highest positive score."""
+    best = np.argsort(-scores, axis=1, kind="stable")[:, :count]
+    found = ((i, j) for i, others in enumerate(best.tolist()) for j in others if scores[i, j] > 0)
+    return sorted({(names[min(pair)], names[max(pair)]) for pair in found})
+
+
+def _rows(descriptors: UInt8[Array, "n 128"]) -> Float[Tensor, "m 128"]:
+    """Convert the descriptors of the largest features to RootSIFT, with zeros for those that are missing."""
+    rows = torch.zeros(_PER_PHOTO, 128)
+    found = torch.from_numpy(descriptors[:_PER_PHOTO].astype(np.float32))
+    rows[: len(found)] = torch.sqrt(found / found.sum(1, keepdim=True).clamp_min(1e-9))
+    return rows
+
+
+def _possible_matches(photo: Float[Tensor, "m 128"], others: Float[Tensor, "k m 128"]) -> Int[Array, " k"]:
+    """Count the features of each other photo that are clearly nearest to a feature of this one."""
+    counts = []
+    for some in others.split(_AT_ONCE):
+        cosines = (photo @ some.flatten(0, 1).T).unflatten(1, some.shape[:2])
+        nearest, where = cosines.max(2)
+        second = cosines.scatter_(2, where[..., None], -1.0).amax(2)
+        clear = 1 - nearest < _CLEARLY**2 * (1 - second)
+        found = torch.zeros(len(some), len(photo) + 1)
+        found.scatter_(
+            1, torch.where(clear, where, len(photo)).T, 1.0
+        )  # the last column takes the unclear ones
+        counts.append(found[:, :-1].sum(1))
+    return torch.cat(counts).int().numpy() if counts else np.zeros(0, dtype=int)

@@ -7,7 +7,8 @@ import pytest
 from PIL import ExifTags, Image
 
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.scene.pairing import pairs_to_match, similar_pairs
+from lang3dxl_ns.scene import pairing
+from lang3dxl_ns.scene.pairing import pairs_that_share, pairs_to_match, similar_pairs
 from lang3dxl_ns.scene.photo_folder import find_photos, readable, shared_cameras
 
 
@@ -121,10 +122,23 @@ def test_similar_photos_find_each_other():
     assert len(pairs) == 4 * 15
 
 
-def test_large_collections_are_matched_with_neighbors_alone():
+def test_photos_that_match_the_same_one_are_paired_unless_they_were():
+    matched = {("a", "b"), ("b", "c"), ("c", "d")}
+    assert pairs_that_share("abcde", matched, matched) == [("a", "c"), ("b", "d")]
+    assert pairs_that_share("abcde", {*matched, ("a", "c")}, matched) == [("b", "d")]
+
+
+def test_photos_without_features_look_like_no_other():
+    same = np.random.default_rng(0).integers(0, 255, (60, 128), dtype=np.uint8)
+    described = {"a": same, "b": same[:0], "c": same, "d": same[:0]}
+    assert similar_pairs("abcd", described.__getitem__, 5) == [("a", "c")]
+
+
+def test_large_collections_are_matched_with_neighbors_alone(monkeypatch):
+    monkeypatch.setattr(pairing, "EXHAUSTIVE", 20)
     rng = np.random.default_rng(0)
-    names = [f"{i:03d}" for i in range(260)]
+    names = [f"{i:03d}" for i in range(60)]
     described = {name: rng.integers(0, 255, (20, 128), dtype=np.uint8) for name in names}
     pairs = pairs_to_match(names, described.__getitem__)
-    assert len(set(pairs)) == len(pairs) < 260 * 60
+    assert len(set(pairs)) == len(pairs) < 60 * (20 + 4)
     assert set(pairwise(names)) <= set(pairs)

@@ -12,7 +12,7 @@ from scenes import speckled, write_scene
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import locked
-from lang3dxl_ns.scene import matching
+from lang3dxl_ns.scene import matching, pairing
 from lang3dxl_ns.scene import reconstruct as module
 from lang3dxl_ns.scene.colmap import read_reconstruction
 from lang3dxl_ns.scene.matching import numbered
@@ -265,6 +265,33 @@ def test_a_stopped_reconstruction_goes_on_with_what_it_has(photos, monkeypatch):
     reconstruct_scene(photos, None, SIFT)
     assert sorted(extracted) == [f"{i:06d}.jpg" for i in range(7)]  # each once
     assert len(matched) == 7 * 6 // 2 - 10
+
+
+def test_large_collections_are_matched_in_rounds_that_go_on_where_they_stopped(photos, tmp_path, monkeypatch):
+    """Every pair is tried once, and partners of partners are among them."""
+    monkeypatch.setattr(pairing, "EXHAUSTIVE", 0)
+    monkeypatch.setattr(pairing, "ALIKE", 1)
+    monkeypatch.setattr(matching, "_CHUNK_PAIRS", 2)
+    match, tried, most = pycolmap.match_image_pairs, [], [1000]
+
+    def noted(database, options, pairs):
+        if len(tried) >= most[0]:
+            raise KeyboardInterrupt
+        tried.extend(pairs.match_list_path.read_text().splitlines())
+        match(database, options, pairs)
+
+    monkeypatch.setattr(pycolmap, "match_image_pairs", noted)
+    shutil.copytree(photos, tmp_path / "other")
+    reconstruct_scene(tmp_path / "other", None, SIFT)
+    whole = sorted(tried)
+    assert len(set(whole)) == len(whole) == 7 * 6 // 2  # by name and looks alone, it would be fewer
+    tried.clear()
+    most[0] = len(whole) - 1  # in the last round
+    with pytest.raises(KeyboardInterrupt):
+        reconstruct_scene(photos, None, SIFT)
+    most[0] = 1000
+    reconstruct_scene(photos, None, SIFT)
+    assert sorted(tried) == whole
 
 
 def test_photos_in_a_folder_of_that_name_beside_the_work_stay(photos, tmp_path):
