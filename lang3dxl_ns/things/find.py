@@ -38,7 +38,7 @@ SURE = 0.6
 """Number of views, relative to the typical thing's, above which a thing is sure."""
 MISSED = 1.4
 """Likely number of things for each one found, at most: what few photos show is missed. So ranges of windows
-hold on six of six validation landmarks, and with the candidates alone on four."""
+hold on six of eight validation landmarks."""
 PRESENT = 0.9
 """Relevancy that a thing's best Gaussian reaches; one that stays below it is a candidate. On eight validation
 landmarks 8 of 511 true things stay below (all windows), and 25 of 74 false ones."""
