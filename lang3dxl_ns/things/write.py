@@ -56,9 +56,8 @@ def write_catalog(scene: Scene, answers: Sequence[Things], folder: Path) -> None
     content |= {"up": up.tolist(), "unit": None if place is None else asdict(place)}
     write_atomically(folder / "things.json", json.dumps(content, indent=1) + "\n")
     rows = io.StringIO()
+    rows.write("id,word,score,views,x,y,z,width,depth,height,photo,width_m,depth_m,height_m\n")
     table = csv.writer(rows, lineterminator="\n")
-    sides = ["width", "depth", "height"]
-    table.writerow(["id", "word", "score", "views", *"xyz", *sides, "photo", *(f"{s}_m" for s in sides)])
     for thing, size in zip(things, meters, strict=True):
         seen = thing.sightings[0].photo if thing.sightings else ""
         numbers = [*thing.center.round(4).tolist(), *thing.size.round(4).tolist(), seen, *(size or [""] * 3)]

@@ -152,7 +152,7 @@ export class List extends EventTarget {
     const note = [doubt ? ` Unsure, since ${doubt}.` : "", sure, ...words.flatMap(advice).map((told) => ` But ${told}.`)].join("");
     if (request.count) {
       this.dispatchEvent(new Event("change"));
-      return `${every ? count(first.found) : chosen.length} ${shown(request.word)}.${note}`;
+      return `${shown(request.word)}: ${every ? count(first.found) : chosen.length}.${note}`; // which suits one and many
     }
     if (chosen.length) this.choose(first, chosen[0]);
     else this.dispatchEvent(new Event("change"));

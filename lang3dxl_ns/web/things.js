@@ -1,34 +1,36 @@
 // Single things out of a word's relevancy, as in Python's things/: pieces of each view, joined by shared Gaussians.
-// Python renders the heat that is cut into pieces; here it is drawn from the pixels that each Gaussian fills.
+// The heat that is cut into pieces is composited front to back, as training renders it: what spreads each Gaussian's
+// share of a view over its ellipse smears heat over edges, and one thing falls into several.
 import language from "./language.js";
 import { fitted } from "./like.js";
 import { BLUR, spreadAt } from "./pick.js";
 import { seenAt } from "./space.js";
 
-const { LEVELS, PART, DEPTH, FILLED, SHARED, SPLINTER, VIEWS, CRUMB, OFTEN, OVER, OVERLAP, OUTLIERS, COLORED, PRESENT, SAME, SLIM, STRAIGHT, ROUND, CROWN } = language.things;
-const SIDE = 240, LEAST = 3; // pixels of a view's longer side, and of the smallest piece
-const FAINT = 0.05, TRACE = 0.004, REACH = 2.5; // relevancy and heat that leave no trace, standard deviations that are drawn
+const { LEVELS, LEAST, PART, DEPTH, FILLED, SHARED, SPLINTER, VIEWS, CRUMB, OFTEN, OVER, OVERLAP, OUTLIERS, COLORED, PRESENT, SAME, SLIM, STRAIGHT, ROUND, CROWN } = language.things;
+const SIDE = 256; // pixels of a view's longer side
+const HIDDEN = 1e-3; // of a pixel's light: what lies behind is not seen
 const RIDGE = 0.1, ROUNDS = 12; // strength of the colors' regularization, Newton steps
 const DC = 0.28209479177387814; // of spherical harmonics: colors are compared as coefficients
 
 /** Find the things of a word: { things, candidates }, each largest first. views: as of find.js; scene: { centers, axes,
- * bytes (packed splats), mass, gap, edges (of boxes, a direction each) }, in one frame; present: whether the word is surely there. */
-export function thingsOf(views, scene, relevancy, present) {
+ * bytes (packed splats), mass, gap, edges (of boxes, a direction each), antialiased }, in one frame; taught: whether examples taught the word. */
+export function thingsOf(views, scene, relevancy, taught) {
   const heat = sharpened(scene, relevancy), { mass } = scene;
   const weight = Float64Array.from(relevancy, (value, i) => Math.sqrt(mass[i]) * value);
   const box = ({ rows }) => uprightBox(rows, scene.centers, weight, scene.edges);
   const parts = grown(join(views.flatMap((view, v) => piecesOf(drawn(view, scene, heat), v)), weight, box), weight.length);
   const joined = placed(parts, parts.map(box));
-  const sure = new Set(withoutCrumbs(joined).filter((one) => present && photosOf(one).size >= VIEWS));
+  const isPresent = ({ rows }) => taught || rows.some((i) => relevancy[i] >= PRESENT);
+  const sure = new Set(withoutCrumbs(joined).filter((one) => photosOf(one).size >= VIEWS && isPresent(one)));
   const listed = (some) => some.map((one) => described(one, scene, weight, relevancy)).sort((a, b) => b.weight - a.weight);
   return { things: listed([...sure]), candidates: listed(joined.filter((one) => !sure.has(one))) };
 }
 
-/** How surely a word names something here: 0 (its peak stays below the lowest level), 1 (perhaps) or 2. */
-export function presence(relevancy, { best }) {
+/** Whether a word names something here: its peak exceeds the lowest level. */
+export function isThere(relevancy, { best }) {
   const sorted = relevancy.slice().sort(), top = Math.max(Math.ceil(best * sorted.length), 1);
   const peak = sorted.slice(-top).reduce((sum, value) => sum + value, 0) / top;
-  return (peak > LEVELS[0]) + (peak >= PRESENT);
+  return peak > LEVELS[0];
 }
 
 /** Things that were found before: one keeps its id whatever word finds it. */
@@ -80,7 +82,7 @@ export function sharpened({ centers, bytes, mass, gap }, relevancy) {
     return rows.map((i) => ({ at: color(i), is: 1 - other, weight: Math.sqrt(mass[i]) * share }));
   });
   const beta = fitted(samples, 4, RIDGE, ROUNDS);
-  return relevancy.map((value, i) => (value > FAINT ? value / (1 + Math.exp(-color(i).reduce((sum, x, k) => sum + x * beta[k], 0))) : 0));
+  return relevancy.map((value, i) => value / (1 + Math.exp(-color(i).reduce((sum, x, k) => sum + x * beta[k], 0))));
 }
 
 /** Return a function that tells whether a Gaussian lies within a distance of one of these rows. */
@@ -101,48 +103,72 @@ function neighborhood(centers, rows, distance) {
   };
 }
 
-/** Draw a view's heat and depth: what each Gaussian fills, spread over its footprint. */
-export function drawn(view, { centers, axes }, heat) {
+/** Draw a view's heat, the mean depth of what is hot, and that of what is seen, at the pixels that something hot reaches. */
+export function drawn(view, scene, heat) {
   const scale = Math.min(1, SIDE / Math.max(view.width, view.height)), { rows, codes, sizes } = view;
   const [fx, fy, cx, cy] = [view.fx, view.fy, view.cx, view.cy].map((value) => value * scale);
-  const width = Math.round(view.width * scale), height = Math.round(view.height * scale), filled = width * height, small = { ...view, fx, fy, cx, cy, width, height };
-  const map = new Float32Array(filled), depth = new Float32Array(filled), points = new Float32Array(3 * rows.length);
+  const width = Math.round(view.width * scale), height = Math.round(view.height * scale), small = { ...view, fx, fy, cx, cy, width, height };
+  const [map, depth, surface, clear] = [0, 1, 2, 3].map(() => new Float32Array(width * height)), points = new Float32Array(3 * rows.length), ellipses = [];
   for (let n = 0; n < rows.length; n++) {
-    const i = rows[n], place = seenAt(small, centers.subarray(3 * i, 3 * i + 3)), [x, y, z] = place;
+    const i = rows[n], place = seenAt(small, scene.centers.subarray(3 * i, 3 * i + 3)), [x, y, z] = place, one = z > 0 && ellipseOf(small, scene, i, place);
     points.set([x, y, sizes[codes[n]] * view.width * view.height < FILLED ? NaN : z], 3 * n); // NaN belongs to no piece
-    if (heat[i] <= FAINT || !(z > 0)) continue;
-    const [a, uv, b] = spreadAt(small, axes, i, place), uu = a + BLUR, vv = b + BLUR;
-    const area = uu * vv - uv * uv, most = (heat[i] * sizes[codes[n]] * filled) / (2 * Math.PI * Math.sqrt(area));
-    const wide = REACH * Math.sqrt(uu), tall = REACH * Math.sqrt(vv);
-    const first = Math.max(Math.ceil(x - wide - 0.5), 0), last = Math.min(Math.floor(x + wide - 0.5), width - 1), bottom = Math.min(Math.floor(y + tall - 0.5), height - 1);
-    if (most < TRACE) continue;
-    for (let row = Math.max(Math.ceil(y - tall - 0.5), 0); row <= bottom; row++)
-      for (let column = first, dv = row + 0.5 - y; column <= last; column++) {
-        const du = column + 0.5 - x, far = (vv * du * du - 2 * uv * du * dv + uu * dv * dv) / area;
-        if (far > REACH * REACH) continue;
-        const share = most * Math.exp(-far / 2), at = row * width + column;
-        map[at] += share;
-        depth[at] += share * z;
-      }
+    if (one) ellipses.push(one);
+    if (one && heat[i] > LEVELS[0]) eachRow(one, small, (first, last) => clear.fill(1, first, last));
   }
-  for (let at = 0; at < filled; at++) if (map[at] > 0) depth[at] /= map[at];
-  return { map, depth, width, height, rows, points, focal: fx, scale };
+  const hot = new Int32Array(clear.length + 1).fill(clear.length); // the next hot pixel from each on
+  for (let at = clear.length - 1; at >= 0; at--) hot[at] = clear[at] ? at : hot[at + 1];
+  for (const one of ellipses.sort((a, b) => a.z - b.z)) {
+    const { i, z, opacity, narrow } = one;
+    eachRow(one, small, (first, last, aside, far) => {
+      for (let at = hot[first]; at < last; at = hot[at + 1]) {
+        if (clear[at] < HIDDEN) continue;
+        const d = aside + at - first, share = clear[at] * Math.min(opacity * Math.exp(-(narrow * d * d + far) / 2), 0.999);
+        clear[at] -= share;
+        map[at] += share * heat[i];
+        depth[at] += share * heat[i] * z;
+        surface[at] += share * z;
+      }
+    });
+  }
+  for (let at = 0; at < width * height; at++) {
+    if (map[at] > 0) depth[at] /= map[at];
+    if (clear[at] < 1) surface[at] /= 1 - clear[at];
+  }
+  return { map, depth, surface, width, height, rows, points, focal: fx, scale };
+}
+
+/** Find the ellipse that a Gaussian fills in a view; null if it fills none. */
+function ellipseOf(view, { axes, opacities, antialiased }, i, [x, y, z]) {
+  const [a, uv, b] = spreadAt(view, axes, i, [x, y, z]), uu = a + BLUR, vv = b + BLUR, area = uu * vv - uv * uv;
+  const opacity = opacities[i] * (antialiased ? Math.sqrt(Math.max((a * b - uv * uv) / area, 0)) : 1), reach = 2 * Math.log(255 * opacity);
+  return reach > 0 ? { i, x, y, z, opacity, reach, tall: vv, slope: uv / vv, narrow: vv / area } : null;
+}
+
+/** Go through the rows of pixels that an ellipse fills: the first pixel, the one after the last, how far the first lies
+ * to the right of the row's middle, and that one's squared distance in standard deviations. */
+function eachRow({ x, y, reach, tall, slope, narrow }, { width, height }, paint) {
+  const high = Math.sqrt(reach * tall), bottom = Math.min(Math.floor(y + high - 0.5), height - 1);
+  for (let row = Math.max(Math.ceil(y - high - 0.5), 0); row <= bottom; row++) {
+    const down = row + 0.5 - y, far = (down * down) / tall, wide = Math.sqrt(Math.max(reach - far, 0) / narrow), middle = x + slope * down - 0.5;
+    const first = Math.max(Math.ceil(middle - wide), 0), last = Math.min(Math.floor(middle + wide), width - 1);
+    if (first <= last) paint(row * width + first, row * width + last + 1, first - middle, far);
+  }
 }
 
 // ── pieces ──
 
 /** Find the pieces of a map that is drawn, with the Gaussians that each one shows. */
-export function piecesOf({ map, depth, width, height, rows, points, focal, scale }, view) {
+export function piecesOf({ map, depth, surface, width, height, rows, points, focal, scale }, view) {
   const { labels, pieces } = split(map, width, height), own = pieces.map(() => []);
   for (let k = 0; k < rows.length; k++) {
     const x = points[3 * k], y = points[3 * k + 1], z = points[3 * k + 2];
     if (!(x >= 0 && x < width && y >= 0 && y < height)) continue;
     const at = Math.floor(y) * width + Math.floor(x);
-    if (labels[at] && Math.abs(z - depth[at]) < DEPTH * z) own[labels[at] - 1].push(rows[k]);
+    if (labels[at] && (Math.abs(z - depth[at]) < DEPTH * z || Math.abs(z - surface[at]) < DEPTH * z)) own[labels[at] - 1].push(rows[k]);
   }
   return pieces.flatMap((pixels, k) => {
     if (!own[k].length) return [];
-    const depths = Float32Array.from(pixels, (p) => depth[p]).sort(), half = depths.length >> 1;
+    const depths = Float32Array.from(pixels, (p) => surface[p]).sort(), half = depths.length >> 1;
     const middle = depths.length % 2 ? depths[half] : (depths[half - 1] + depths[half]) / 2;
     let [left, top, right, bottom] = [width, height, 0, 0];
     for (const p of pixels) {
@@ -155,7 +181,7 @@ export function piecesOf({ map, depth, width, height, rows, points, focal, scale
 }
 
 /** Number the pieces of a map from 1, and list the pixels of each. */
-export function split(map, width, height, least = LEAST) {
+export function split(map, width, height) {
   const labels = new Int32Array(map.length), pieces = [], stamps = new Int32Array(map.length);
   let stamp = 0;
   const parts = (pixels, level) => {
@@ -176,13 +202,13 @@ export function split(map, width, height, least = LEAST) {
   };
   const leaves = (region, level) => {
     if (level === LEVELS.length) return [region];
-    const large = parts(region, LEVELS[level]).filter((part) => part.length >= Math.max(least, PART * region.length));
+    const large = parts(region, LEVELS[level]).filter((part) => part.length >= Math.max(LEAST, PART * region.length));
     const found = large.flatMap((part) => leaves(part, level + 1));
     return found.length > 1 ? found : [region];
   };
   const everywhere = [];
   for (let p = 0; p < map.length; p++) if (map[p] > LEVELS[0]) everywhere.push(p);
-  for (const region of parts(everywhere, LEVELS[0])) if (region.length >= least) pieces.push(...leaves(region, 1));
+  for (const region of parts(everywhere, LEVELS[0])) if (region.length >= LEAST) pieces.push(...leaves(region, 1));
   pieces.forEach((pixels, k) => pixels.forEach((p) => (labels[p] = k + 1)));
   return { labels, pieces };
 }

@@ -6,7 +6,7 @@ import { likeness } from "./like.js";
 import { bestPhoto, gaussiansAt, middleOf, unpackSplats } from "./pick.js";
 import { freeSpace } from "./space.js";
 import { fetched } from "./think.js";
-import { Known, presence, thingsOf } from "./things.js";
+import { isThere, Known, thingsOf } from "./things.js";
 import { ancestry, FAN } from "./tree.js";
 import { Vocabulary } from "./vocabulary.js";
 
@@ -130,9 +130,8 @@ const jobs = {
 
   /** Find the single things of an answer: { things, candidates }. */
   things({ relevancy, taught }) {
-    const sure = presence(relevancy, about.words.rules);
-    if (!sure) return { things: [], candidates: [] };
-    const found = thingsOf(views, { ...geometry, mass, gap: about.words.gap, edges: about.edges }, relevancy, taught || sure > 1);
+    if (!isThere(relevancy, about.words.rules)) return { things: [], candidates: [] };
+    const found = thingsOf(views, { ...geometry, mass, gap: about.words.gap, edges: about.edges, antialiased: about.antialiased }, relevancy, taught);
     const placed = (thing) => ({ ...thing, center: inWorld(thing.center) });
     return { things: found.things.map((thing) => placed({ ...thing, id: known.id(thing) })), candidates: found.candidates.map(placed) };
   },

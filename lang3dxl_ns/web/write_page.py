@@ -62,7 +62,7 @@ _SUGGESTED = (
 """Words that a first visitor is offered, where the scene knows them."""
 _NUMBERS = (
     ("ranking", view_ranking, "PEAK LARGE RIM STRONG"),
-    ("things", pieces, "LEVELS PART DEPTH FILLED"),
+    ("things", pieces, "LEVELS LEAST PART DEPTH FILLED"),
     ("things", join, "SHARED SPLINTER VIEWS CRUMB OFTEN OVER OVERLAP SLIM STRAIGHT ROUND CROWN"),
     ("things", thing, "OUTLIERS"),
     ("things", find, "COLORED PRESENT SAME SURE MISSED"),

@@ -17,7 +17,7 @@ from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.query.trust import FAR
 from lang3dxl_ns.rendering import Camera, Rendering
 from lang3dxl_ns.scene.georeference import Georeference
-from lang3dxl_ns.things.find import Things, axes_of, heights_of, up_of
+from lang3dxl_ns.things.find import PRESENT, Things, axes_of, heights_of, things_of, up_of
 from lang3dxl_ns.things.grammar import Request, Sight, answer, parse, sight_of, table, unsure
 from lang3dxl_ns.things.join import OFTEN, Joined, grown, join, placed, without_crumbs
 from lang3dxl_ns.things.pieces import Piece, Shown, pieces_of, split
@@ -268,6 +268,16 @@ def test_what_a_word_that_hardly_fits_finds_are_candidates(monkeypatch):
     monkeypatch.setattr("lang3dxl_ns.things.find.PRESENT", 1.1)
     (answer,) = painted_scene().things("windows")
     assert answer.count == "0, perhaps 0 to 2"
+
+
+def test_a_place_that_fits_less_than_things_do_is_a_candidate_beside_one_that_fits():
+    scene = painted_scene()
+    right, question = scene.splats.means[:, 0] > -1.3, scene.ask("windows")
+    plain = question.relevancy / question.relevancy.max()
+    for share, counts in ((1.0, (2, 0)), (0.95 * PRESENT, (1, 1))):
+        question.__dict__["relevancy"] = torch.where(right, share * plain, plain)
+        (found,) = things_of(scene, question)
+        assert (len(found.things), len(found.candidates)) == counts
 
 
 def test_a_sample_of_the_gaussians_tells_the_colors_of_a_word(monkeypatch):
