@@ -9,6 +9,9 @@ import { seenAt } from "./space.js";
 const { LEVELS, LEAST, PART, DEPTH, FILLED, SHARED, SPLINTER, VIEWS, CRUMB, OFTEN, OVER, OVERLAP, OUTLIERS, COLORED, PRESENT, SAME, SLIM, STRAIGHT, ROUND, CROWN } = language.things;
 const SIDE = 256; // pixels of a view's longer side
 const HIDDEN = 1e-3; // of a pixel's light: what lies behind is not seen
+const HOT = 0.1; // share of a pixel that one hot Gaussian covers where the map may be hot
+const FINE = 512; // steps of the falloff's table for each squared standard deviation
+const FALLOFF = Float64Array.from({ length: 12 * FINE }, (_, k) => Math.exp(-k / FINE / 2)); // reaches beyond 2 log 255
 const RIDGE = 0.1, ROUNDS = 12; // strength of the colors' regularization, Newton steps
 const DC = 0.28209479177387814; // of spherical harmonics: colors are compared as coefficients
 
@@ -113,20 +116,23 @@ export function drawn(view, scene, heat) {
     const i = rows[n], place = seenAt(small, scene.centers.subarray(3 * i, 3 * i + 3)), [x, y, z] = place, one = z > 0 && ellipseOf(small, scene, i, place);
     points.set([x, y, sizes[codes[n]] * view.width * view.height < FILLED ? NaN : z], 3 * n); // NaN belongs to no piece
     if (one) ellipses.push(one);
-    if (one && heat[i] > LEVELS[0]) eachRow(one, small, (first, last) => clear.fill(1, first, last));
+    if (one && heat[i] > LEVELS[0] && one.opacity > HOT) eachRow({ ...one, reach: 2 * Math.log(one.opacity / HOT) }, small, (first, last) => clear.fill(1, first, last));
   }
-  const hot = new Int32Array(clear.length + 1).fill(clear.length); // the next hot pixel from each on
-  for (let at = clear.length - 1; at >= 0; at--) hot[at] = clear[at] ? at : hot[at + 1];
+  const next = Int32Array.from({ length: clear.length + 1 }, (_, at) => at + (clear[at] === 0)); // leads to the next pixel that still matters
+  const open = (at) => {
+    while (next[at] !== at) at = next[at] = next[next[at]];
+    return at;
+  };
   for (const one of ellipses.sort((a, b) => a.z - b.z)) {
     const { i, z, opacity, narrow } = one;
     eachRow(one, small, (first, last, aside, far) => {
-      for (let at = hot[first]; at < last; at = hot[at + 1]) {
-        if (clear[at] < HIDDEN) continue;
-        const d = aside + at - first, share = clear[at] * Math.min(opacity * Math.exp(-(narrow * d * d + far) / 2), 0.999);
+      for (let at = open(first); at < last; at = open(at + 1)) {
+        const d = aside + at - first, share = clear[at] * Math.min(opacity * FALLOFF[((narrow * d * d + far) * FINE + 0.5) | 0], 0.999);
         clear[at] -= share;
         map[at] += share * heat[i];
         depth[at] += share * heat[i] * z;
         surface[at] += share * z;
+        if (clear[at] < HIDDEN) next[at] = at + 1;
       }
     });
   }
