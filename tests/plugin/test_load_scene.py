@@ -80,9 +80,7 @@ def test_the_loaded_model_renders_as_the_trained_one(scene, trainer):
     camera = scene.camera("photo_001.jpg")
     outputs = model.get_outputs_for_camera(view_of(camera))
     off = (scene.draw(camera).rgb - outputs["rgb"]).abs()
-    assert (
-        off.max() < 1 / 255
-    )  # what the rasterizer leaves out: a pose that is rounded otherwise moves its edge
+    assert off.max() < 1 / 255  # the rasterizer leaves it out: rounded poses move its edge
     assert (off > 1e-5).float().mean() < 1e-3
     torch.testing.assert_close(scene.codes, model.gauss_params["codes"].data, equal_nan=True)
 
