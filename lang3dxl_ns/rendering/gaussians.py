@@ -66,10 +66,6 @@ class Gaussians:
             shown = (depth / (CLOSEST * self.scales.amax(1)).clamp_min(1e-30) - 1).clamp(0.0, 1.0)
         return replace(self, opacities=self.opacities * shown)
 
-    def moved(self: Kind, by: Float[Tensor, "3"]) -> Kind:
-        """Return the same Gaussians with shifted centers."""
-        return replace(self, means=self.means + by)
-
 
 @dataclass(frozen=True)
 class Ellipses:

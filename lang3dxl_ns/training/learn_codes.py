@@ -49,8 +49,9 @@ class TargetView:
 
 
 def begin_codes(run: Training, data: TrainingData) -> None:
-    """Let codes begin where the warm-up ends, from the photos' features if the settings say so."""
-    if run.codes_begin:
+    """Let codes begin where the warm-up ends, from the photos' features if the settings say so: once per run,
+    also if it is resumed or prolonged."""
+    if run.learns_from_renderings and run.warm_up_is_over and not run.codes_have_begun:
         if run.settings.codes_from == "photos":
             learn_words(run, data)
         run.codes_have_begun = True

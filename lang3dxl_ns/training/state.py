@@ -118,23 +118,17 @@ class Training:
     @property
     def learns_from_renderings(self) -> bool:
         """Whether semantics are trained with the scene instead of being gathered afterwards."""
-        return self.parts.semantics is not None and self.parts.semantics.learned_from_renderings
+        return self.parts.semantics is not None and not self.parts.semantics.decoder.needs_lifting
 
     @property
     def learns_words_at_the_end(self) -> bool:
         """Whether semantics are gathered from the photos after the last iteration."""
-        return self.parts.semantics is not None and not self.parts.semantics.learned_from_renderings
+        return self.parts.semantics is not None and self.parts.semantics.decoder.needs_lifting
 
     @property
     def warm_up_is_over(self) -> bool:
         """Whether the present iteration trains more than colors."""
         return self.step >= self.settings.warm_up * self.settings.total_steps
-
-    @property
-    def codes_begin(self) -> bool:
-        """Whether codes are about to be trained for the first time. This is so once per run, also if the run
-        is resumed or prolonged."""
-        return self.learns_from_renderings and self.warm_up_is_over and not self.codes_have_begun
 
     @property
     def degree(self) -> int | None:
