@@ -242,10 +242,9 @@ class Look:
         camera sees; `everywhere` relights all of them, not only those that it may see. The camera's position
         matters only if colors depend on it, because the change of lighting depends on the visible color."""
         camera = camera.to(splats.means.device)
-        rows = torch.ones(len(splats), dtype=torch.bool, device=splats.means.device)
+        seen = torch.arange(len(splats), device=splats.means.device)
         if not everywhere:
-            rows = in_view(camera, splats.means, splats.scales)
-        seen = rows.nonzero().squeeze(1)
+            seen = seen[in_view(camera, splats.means, splats.scales)]
         colors, lit = self.field(splats.gaussians, splats.colors(camera.position), self.vector, seen)
         return replace(splats, opacities=lit.opacities, harmonics=harmonics_of(colors))
 

@@ -46,10 +46,6 @@ class Gaussians:
     opacities: Float[Tensor, " n"]
     """Peak opacity, 0…1."""
 
-    def detach(self: Kind) -> Kind:
-        """Return the same Gaussians without gradient."""
-        return self.mapped(Tensor.detach)
-
     def mapped(self: Kind, change: Callable[[Tensor], Tensor]) -> Kind:
         """Return the Gaussians with a change to each of their tensors."""
         values = {f.name: getattr(self, f.name) for f in fields(self)}
