@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from contextlib import nullcontext
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 import viser
@@ -17,18 +17,17 @@ from numpy import ndarray as Array
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.worker import Worker
+from lang3dxl_ns.plugin.model import Lang3DXLModel
 from lang3dxl_ns.plugin.viewer_guard import guard_viewers
 from lang3dxl_ns.query.match import Found
 from lang3dxl_ns.scene.camera import Camera
-from lang3dxl_ns.scene.record import overview
+from lang3dxl_ns.scene.record import SceneRecord, overview
 from lang3dxl_ns.things.thing import Thing
 from lang3dxl_ns.training.conversation import Conversation, plain
 
 if TYPE_CHECKING:
     from nerfstudio.engine.trainer import Trainer
     from nerfstudio.viewer.viewer import Viewer
-
-    from lang3dxl_ns.plugin.pipeline import Lang3DXLPipeline  # imports this module
 
 INVITATION = (
     'Type what to look for: `rose window`, several as `dome; towers`, or `"windows" not "doors"`. '
@@ -40,11 +39,26 @@ _TYPING = 0.5
 """Seconds after the last keystroke until the text takes effect."""
 
 
+class Asked(Protocol):
+    """What the panel asks of a pipeline, whose module imports this one."""
+
+    @property
+    def model(self) -> Lang3DXLModel: ...
+
+    @property
+    def scene_file(self) -> SceneRecord: ...
+
+    @property
+    def query(self) -> str: ...
+
+    def learn_words(self) -> None: ...
+
+
 class AskPanel(ViewerControl):
     """A text box, heat maps over the view, and the views that show a match best. nerfstudio's viewer finds
     the panel as an attribute of the pipeline, and sets it up on start."""
 
-    def __init__(self, pipeline: Lang3DXLPipeline) -> None:
+    def __init__(self, pipeline: Asked) -> None:
         guard_viewers()  # must precede the server that nerfstudio starts
         self._pipeline, self._model = pipeline, pipeline.model
         self._views: list[tuple[Found, int]] = []
