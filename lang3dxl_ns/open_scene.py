@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -48,20 +46,13 @@ def load_scene(
             encode_texts = text_encoder(about, known_device(device))
         return read_scene(file, device, settings, encode_texts)
     silence_libraries()  # nerfstudio's imports print warnings that a user can do nothing about
-    with _nerfstudio():
-        from lang3dxl_ns.plugin.load_scene import load_run
-    return load_run(path, device, settings, clip)
-
-
-@contextmanager
-def _nerfstudio() -> Iterator[None]:
-    """Import what needs nerfstudio. Raises UserError if it is not installed."""
     try:
-        yield
+        from lang3dxl_ns.plugin.load_scene import load_run
     except ModuleNotFoundError as error:
         if not misses_nerfstudio(error):
             raise
         raise UserError(NO_NERFSTUDIO) from error
+    return load_run(path, device, settings, clip)
 
 
 def find_scene_file(path: str | Path | None = None) -> Path | None:

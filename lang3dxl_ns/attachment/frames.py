@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -93,9 +93,7 @@ def find_frame(splats: Splats, collection: Capture, splat: Path) -> Fit:
     if found.score >= _CLOSE:
         return found
     worth = [found] if found.fits else [f for f in checked if f.score >= min(_PROMISING, found.score)]
-    every = -(-len(splats) // _MOST)
-    thinned = splats.select(torch.arange(0, len(splats), every))
-    thinned = replace(thinned, scales=thinned.scales * every**0.5)  # fewer Gaussians cover as much together
+    thinned = splats.thinned(_MOST)
     with progress("refining the frame", len(worth) * sum(steps for _, steps in _ROUNDS)) as advance:
         for fit in worth:
             refined = fit.similarity

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -56,7 +56,7 @@ def find_up(solid: Splats, center: Float[Tensor, "3"], radius: float) -> Upright
     walls all around. In views with the right one up, the sky is above, doors are below, and crops look like
     what words name; the built-in CLIP judges that.
     """
-    solid = _thinned(solid.select((solid.means - center).norm(dim=1) < _NEAR * radius))
+    solid = solid.select((solid.means - center).norm(dim=1) < _NEAR * radius).thinned(_GAUSSIANS)
     judge = _Judge(load_image_text_encoder(BUILTIN, solid.means.device))
     found = list[tuple[float, Float[Tensor, "3"]]]()
     for axis, walls in tracked(_axes(solid.means.double().cpu().numpy()), "finding which way is up"):
@@ -71,12 +71,6 @@ def name_of_axis(direction: Float[Tensor, "3"]) -> str:
     """Return the option that names the axis nearest to a direction: x, -x, y …"""
     nearest = int(direction.abs().argmax())
     return "-" * (float(direction[nearest]) < 0) + "xyz"[nearest]
-
-
-def _thinned(splats: Splats) -> Splats:
-    every = -(-len(splats) // _GAUSSIANS)
-    some = splats.select(torch.arange(0, len(splats), every))
-    return replace(some, scales=some.scales * every**0.5)  # fewer Gaussians cover as much together
 
 
 def _axes(points: Float[Array, "n 3"]) -> list[tuple[Float[Array, "3"], float]]:

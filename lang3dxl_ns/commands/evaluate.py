@@ -13,7 +13,7 @@ from lang3dxl_ns.common.console import say, some
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import read_names, write_atomically
 from lang3dxl_ns.common.reports import describe_machine, markdown_table, write_report
-from lang3dxl_ns.common.settings_help import showing
+from lang3dxl_ns.common.settings_help import OfScene, showing
 from lang3dxl_ns.evaluation.aggregate import average, pool, pooled_table, read_results, scene_table
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth, Layout, held_out_photos
 
@@ -121,11 +121,9 @@ class EvaluateRun(_Scored):
 
 
 @dataclass(kw_only=True)
-class EvaluateThings:
+class EvaluateThings(OfScene):
     """Score single things against the boxes of labels, and write things.md and things.json."""
 
-    scene: tyro.conf.Positional[Path | None] = None
-    """A .scene file, a folder that holds one, or a run (default: the newest under outputs/)."""
     coco: Path
     """COCO instances, or a folder of LERF-OVS labels: boxes in photos; their categories are the words."""
     out: Path
@@ -135,7 +133,7 @@ class EvaluateThings:
         from lang3dxl_ns.evaluation.score_things import score_things
         from lang3dxl_ns.open_scene import load_scene
 
-        scores = score_things(load_scene(self.scene), self.coco)
+        scores = score_things(load_scene(self.scene, clip=self.clip), self.coco)
         table = markdown_table(["word", "there", "found", "false", "F1"], scores)
         write_report(self.out, "things", table, {"scores": scores})
         print(f"{table}\n\nWrote {self.out / 'things'}.md")

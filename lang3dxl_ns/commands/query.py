@@ -10,8 +10,6 @@ from typing import Annotated, Any
 
 import numpy as np
 import tyro
-from jaxtyping import Bool
-from numpy import ndarray as Array
 from PIL import Image
 
 from lang3dxl_ns.commands.coco import CocoLabels, check_labels_file
@@ -78,7 +76,9 @@ class Query(OfScene):
             matches = scene.matches(wanted, photo)
             results.add(name, asked, matches)
             if self.coco is not None:
-                labels.add(photo, _at_size(matches, scene.file.photo(photo).file_size))
+                size = scene.file.photo(photo).file_size
+                masks = (Image.fromarray(m.mask).resize(size, Image.Resampling.NEAREST) for m in matches)
+                labels.add(photo, [np.asarray(mask) for mask in masks])
         if self.coco is not None:
             labels.write(self.coco)
         results.write_report(scene)
@@ -146,11 +146,6 @@ class _Results:
         ours = [*self.out.glob("*/*.npy"), *self.shared.glob("*.png")]  # a user may have other folders there
         if old := sorted({path.parent.name for path in {*ours} - self.written}):
             yield f"{self.out} still has files of an earlier query, not listed in query.json: {some(old)}"
-
-
-def _at_size(matches: Sequence[Match], size: tuple[int, int]) -> list[Bool[Array, "h w"]]:
-    """Return the masks of matches at a width and height."""
-    return [np.asarray(Image.fromarray(m.mask).resize(size, Image.Resampling.NEAREST)) for m in matches]
 
 
 def parse_texts(

@@ -10,18 +10,16 @@ import tyro
 
 from lang3dxl_ns.common.console import say, some
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.common.settings_help import showing
+from lang3dxl_ns.common.settings_help import OfScene, showing
 
 
 @showing("scene", "text", "ask", "out", "splats", "view")
 @dataclass(kw_only=True)
-class ListThings:
+class ListThings(OfScene):
     """List the single things that words name: windows, portals, towers. --out gets things.json (boxes,
     scores, photos, relations), things.csv, instances.json (COCO boxes in all photos) and things.png
     (numbered boxes)."""
 
-    scene: tyro.conf.Positional[Path | None] = None
-    """A .scene file, a folder that holds one, or a run (default: the newest run under outputs/)."""
     text: tyro.conf.UseAppendAction[list[str]] = field(default_factory=list)
     """Word for things, such as windows. Repeat the flag for more."""
     ask: tyro.conf.UseAppendAction[list[str]] = field(default_factory=list)
@@ -33,8 +31,6 @@ class ListThings:
     """Folder for the files."""
     splats: bool = False
     """Write a splat file for each thing too, and scene.glb with things as features (EXT_mesh_features)."""
-    clip: str | None = None
-    """Name or folder of the scene's CLIP, if it is not where the scene file says."""
 
     def main(self) -> None:
         from lang3dxl_ns.open_scene import load_scene

@@ -9,7 +9,7 @@ import threading
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence, Sized
 from contextlib import contextmanager
-from functools import cache
+from functools import cache, partial
 from typing import TypeVar
 
 from lang3dxl_ns.common.errors import printable
@@ -33,11 +33,8 @@ def progress(what: str, total: int) -> Iterator[Callable[..., None]]:
     timer.daemon = True
     timer.start()
 
-    def advance(count: int = 1) -> None:
-        bar.advance(shown, count)
-
     try:
-        yield advance
+        yield partial(bar.advance, shown)
     finally:
         timer.cancel()
         timer.join()

@@ -91,18 +91,14 @@ def _formats() -> tuple[str, ...]:
     return tuple(form for form in (*FORMATS, *_EXTRA) if form in Image.OPEN)
 
 
-@contextmanager
-def _opened(path: Path) -> Iterator[Image.Image]:
+def _opened(path: Path) -> Image.Image:
     formats = _formats()
     try:
-        image = Image.open(path, formats=formats)
+        return Image.open(path, formats=formats)
     except ValueError as error:
-        content = _without_text(path) if "MAX_TEXT" in str(error) else None
-        if content is None:
+        if "MAX_TEXT" not in str(error):
             raise
-        image = Image.open(io.BytesIO(content), formats=["PNG"])
-    with image:
-        yield image
+        return Image.open(io.BytesIO(_without_text(path)), formats=["PNG"])
 
 
 def _without_text(path: Path) -> bytes:

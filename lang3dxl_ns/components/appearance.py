@@ -16,6 +16,7 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
+from lang3dxl_ns.common.console import some
 from lang3dxl_ns.common.device import to_device
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.settings_help import showing
@@ -142,10 +143,8 @@ class AppearanceField(nn.Module):
     def vector(self, name: str) -> Float[Tensor, " v"]:
         """Return the vector of a training photo. Raises UserError if none has this name."""
         if name not in self._rows:
-            raise UserError(
-                f"{name} is not a training photo of this scene: choose one of "
-                f"{', '.join(self.names[:5])}{', …' if len(self.names) > 5 else ''}"
-            )
+            known = some(self.names, 5)
+            raise UserError(f"{name} is not a training photo of this scene: choose one of {known}")
         return self.vectors[self._rows[name]]
 
     @torch.no_grad()
@@ -243,10 +242,9 @@ class Look:
         camera sees; `everywhere` relights all of them, not only those that it may see. The camera's position
         matters only if colors depend on it, because the change of lighting depends on the visible color."""
         camera = camera.to(splats.means.device)
-        rows = torch.ones(len(splats), dtype=torch.bool, device=splats.means.device)
+        seen = torch.arange(len(splats), device=splats.means.device)
         if not everywhere:
-            rows = in_view(camera, splats.means, splats.scales)
-        seen = rows.nonzero().squeeze(1)
+            seen = seen[in_view(camera, splats.means, splats.scales)]
         colors, lit = self.field(splats.gaussians, splats.colors(camera.position), self.vector, seen)
         return replace(splats, opacities=lit.opacities, harmonics=harmonics_of(colors))
 

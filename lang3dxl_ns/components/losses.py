@@ -32,9 +32,9 @@ def rgb_loss(
     mean over the mask. SSIM sees the whole images, as in the published system. An image narrower than the
     window is extended by its border."""
     color = _weighted_mean((prediction - target).abs(), mask)
-    if mask is None:
-        return torch.lerp(color, 1 - _ssim(prediction, target), ssim_weight)
-    structure = torch.where(mask.any(), 1 - _ssim(prediction, target), 0.0)
+    structure = 1 - _ssim(prediction, target)
+    if mask is not None:
+        structure = torch.where(mask.any(), structure, 0.0)
     return torch.lerp(color, structure, ssim_weight)
 
 

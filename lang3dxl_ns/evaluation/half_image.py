@@ -6,7 +6,6 @@ Comparing the whole of an unseen photo mostly measures how well its lighting was
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from time import perf_counter
 from typing import Any
@@ -18,6 +17,7 @@ from torch import Tensor
 from lang3dxl_ns.common.reports import synchronize
 from lang3dxl_ns.components.appearance import AppearanceField, Look, render_in_look
 from lang3dxl_ns.components.losses import rgb_loss
+from lang3dxl_ns.evaluation.photo_metrics import ImageMetrics
 from lang3dxl_ns.rendering import Splats, rasterize
 from lang3dxl_ns.scene.camera import Camera, in_view
 
@@ -35,10 +35,7 @@ class HalfImageProtocol:
     splats: Splats
     field: AppearanceField
     """Appearance field that makes the looks."""
-    metrics: Callable[
-        [Float[Tensor, "h w 3"], Float[Tensor, "h w 3"], Bool[Tensor, "h w"] | None], dict[str, float]
-    ]
-    """Function that scores a rendering against its photo with its mask: `psnr` etc."""
+    metrics: ImageMetrics
     background: Float[Tensor, "3"]
     """Color behind the scene, 0…1."""
     ssim_weight: float

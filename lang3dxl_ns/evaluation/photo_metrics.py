@@ -106,7 +106,7 @@ class ImageMetrics:
     """Metrics of a rendering. It is not an nn.Module, so that its networks stay out of checkpoints."""
 
     def __init__(self) -> None:
-        self._ssim, self._lpips = SSIM(data_range=1.0, size_average=True, channel=3), Lpips()
+        self._ssim = SSIM(data_range=1.0, size_average=True, channel=3)
 
     @torch.no_grad()
     def __call__(
@@ -121,18 +121,17 @@ class ImageMetrics:
         predicted = torch.where(pixels[..., None], predicted, target)
         chw = [image.permute(2, 0, 1)[None] for image in (target, predicted)]
         metrics = {"psnr": float(psnr(predicted[pixels], target[pixels])), "ssim": float(self._ssim(*chw))}
-        perceptual = self._lpips(*chw)
-        return metrics if perceptual is None else metrics | {"lpips": perceptual}
-
-
-class Lpips:
-    """LPIPS (AlexNet), loaded at first use, or skipped if its weights are not in torch's cache: nothing is
-    downloaded without a request."""
+        if self._lpips is not None:
+            metrics["lpips"] = float(self._lpips.to(target.device)(chw[0], chw[1].clamp(0, 1)))
+        return metrics
 
     @cached_property
-    def _metric(self) -> nn.Module | None:
-        if not _weights().is_file():
-            say(f"LPIPS is skipped: it needs {ALEXNET}, put into {_weights().parent}")
+    def _lpips(self) -> nn.Module | None:
+        """LPIPS (AlexNet), loaded at first use, or None if its weights are not in torch's cache: nothing is
+        downloaded without a request."""
+        weights = Path(torch.hub.get_dir()) / "checkpoints" / ALEXNET.rpartition("/")[2]
+        if not weights.is_file():
+            say(f"LPIPS is skipped: it needs {ALEXNET}, put into {weights.parent}")
             return None
         from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
 
@@ -141,16 +140,6 @@ class Lpips:
         except (OSError, RuntimeError) as error:  # damaged file
             say(f"LPIPS is skipped: its weights cannot be loaded ({error})")
             return None
-
-    def __call__(self, target: Float[Tensor, "1 3 h w"], predicted: Float[Tensor, "1 3 h w"]) -> float | None:
-        """Compute the distance of two images in [0, 1]; None without weights."""
-        if self._metric is None:
-            return None
-        return float(self._metric.to(target.device)(target, predicted.clamp(0, 1)))
-
-
-def _weights() -> Path:
-    return Path(torch.hub.get_dir()) / "checkpoints" / ALEXNET.rpartition("/")[2]
 
 
 def match(

@@ -33,9 +33,7 @@ from lang3dxl_ns.plugin.inert_settings import OF_IMAGE_CACHES
 from lang3dxl_ns.plugin.photo_dataset import PhotoDataset
 from lang3dxl_ns.preparation.needs import needs_table
 from lang3dxl_ns.preparation.settings import PreparationConfig
-from lang3dxl_ns.preparation.store import FeatureStore
 from lang3dxl_ns.preparation.targets import FACTS, Batch, SceneFacts
-from lang3dxl_ns.preparation.working_photos import WorkingPhotos
 from lang3dxl_ns.scene.camera import LONGEST_SIDE
 from lang3dxl_ns.scene.companions import cache_folder
 from lang3dxl_ns.scene.record import SCENE_FILE, SceneRecord
@@ -141,7 +139,7 @@ class Lang3DXLDataManager(FullImageDatamanager):
     def _dataset(self, outputs: DataparserOutputs, names: tuple[str, ...]) -> PhotoDataset:
         known = {photo.name: photo for photo in self.data.as_read}
         outputs.metadata["photos"] = [known[name] for name in names]
-        return PhotoDataset(outputs, self.data.scale, WorkingPhotos(FeatureStore(self.data.cache_dir)))
+        return PhotoDataset(outputs, self.data.scale, self.data.working)
 
     def setup_train(self) -> None:
         """Prepare missing targets before training; give the model their statistics and the scene's needs."""

@@ -50,7 +50,7 @@ class Networks:
     """What a worker makes targets with, each loaded when the first target needs it."""
 
     def __init__(self, config: PreparationConfig, regions: RegionSource | None, device: str) -> None:
-        self._config, self._regions, self._device = config, regions, device
+        self._config, self.regions, self._device = config, regions, device
         self.crop_batch = config.crop_batch
 
     @cached_property
@@ -62,12 +62,6 @@ class Networks:
     def dense(self) -> DenseEncoder:
         """Load the dense encoder. Raises UserError if it can't be."""
         return load_dense_encoder(self._config.dense, self._device, self._config.dense_tokens)
-
-    @property
-    def regions(self) -> RegionSource:
-        """Return the source of regions, which loads its own network."""
-        assert self._regions is not None
-        return self._regions
 
     def load(self, kinds: Collection[str]) -> None:
         """Load what targets of these kinds need, before the first photo."""
@@ -159,6 +153,7 @@ class RegionLabels(Target):
     photo: Photo
 
     def make(self, image: Float[Tensor, "h w 3"], networks: Networks) -> dict[str, Tensor]:
+        assert networks.regions is not None
         return {"labels": stored_labels(networks.regions.labels(self.photo, image))}
 
     def numbers(self, networks: Networks) -> int:

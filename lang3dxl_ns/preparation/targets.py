@@ -60,10 +60,6 @@ class TargetReader:
         dense = next((name for name in self.names if DENSE in made_with[name]), None)
         self.dense_dim: int = 0 if dense is None else store.shapes(DENSE, dense)["features"][-1]
 
-    def joined(self, other: TargetReader) -> TargetReader:
-        """Return a reader of both readers' photos, from the same store."""
-        return TargetReader(self._store, {**self._made_with, **other._made_with})
-
     def _settings(self, name: str) -> Mapping[str, dict[str, Any]]:
         if name not in self._made_with:
             raise UserError(f"targets of {name} are not prepared: run `lang3dxl prepare`")

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -104,15 +105,9 @@ class Question:
         """Return the question of one of these prompts."""
         count, one = len(self.prompts), slice(row, row + 1)
         rows = [row, *range(count, len(self.everywhere))]
-        return replace(
-            self,
-            prompts=self.prompts[one],
-            queries=self.queries.select(rows),
-            everywhere=self.everywhere[rows],
-            doubts=self.doubts[one],
-            trusts=self.trusts[one],
-            thresholds=self.thresholds[one],
-        )
+        of_prompts = ("prompts", "doubts", "trusts", "thresholds")
+        kept: dict[str, Any] = {name: getattr(self, name)[one] for name in of_prompts}
+        return replace(self, queries=self.queries.select(rows), everywhere=self.everywhere[rows], **kept)
 
     @torch.no_grad()
     def maps(

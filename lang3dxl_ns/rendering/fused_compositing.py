@@ -84,7 +84,8 @@ class FusedCompositing(torch.autograd.Function):
         )
         maps = Maps(*(slope.numpy() for slope in slopes))
         parts, columns = _parts(ctx.trace.ends), CHANNELS_FROM + plan.table.shape[1]
-        threads = _summing_threads(len(plan.order) * columns * plan.splats.itemsize)
+        each = len(plan.order) * columns * plan.splats.itemsize  # bytes of a thread's sums
+        threads = max(min(torch.get_num_threads(), MOST_SUMS // max(each, 1)), 1)
         # Every thread has fixed tiles and its own sums, so the result does not depend on their order.
         dealt = [np.concatenate(parts[k::threads]) for k in range(min(threads, len(parts)))]
         sums = _kept.take((len(dealt), len(plan.order), columns), plan.splats.dtype)
@@ -105,11 +106,6 @@ class _Gradients(NamedTuple):
     opacity: Float[np.ndarray, " n"]
     channels: Float[np.ndarray, "n c"]
     variances: Float[np.ndarray, "n 2"]
-
-
-def _summing_threads(each: int) -> int:
-    """Return how many threads may keep sums of `each` bytes."""
-    return max(min(torch.get_num_threads(), MOST_SUMS // max(each, 1)), 1)
 
 
 def _parts(work: np.ndarray) -> list[np.ndarray]:

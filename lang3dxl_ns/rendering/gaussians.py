@@ -46,10 +46,6 @@ class Gaussians:
     opacities: Float[Tensor, " n"]
     """Peak opacity, 0…1."""
 
-    def detach(self: Kind) -> Kind:
-        """Return the same Gaussians without gradient."""
-        return self.mapped(Tensor.detach)
-
     def mapped(self: Kind, change: Callable[[Tensor], Tensor]) -> Kind:
         """Return the Gaussians with a change to each of their tensors."""
         values = {f.name: getattr(self, f.name) for f in fields(self)}
@@ -65,10 +61,6 @@ class Gaussians:
             depth = (self.means - place) @ moved.view_matrix[2, :3] + moved.view_matrix[2, 3]
             shown = (depth / (CLOSEST * self.scales.amax(1)).clamp_min(1e-30) - 1).clamp(0.0, 1.0)
         return replace(self, opacities=self.opacities * shown)
-
-    def moved(self: Kind, by: Float[Tensor, "3"]) -> Kind:
-        """Return the same Gaussians with shifted centers."""
-        return replace(self, means=self.means + by)
 
 
 @dataclass(frozen=True)

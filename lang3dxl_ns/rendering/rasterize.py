@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import Any, Literal
 
@@ -76,7 +77,7 @@ def rasterize(
     gaussians, channels = _without_broken(gaussians, channels)
     camera, place = camera.at_origin(gaussians.means)
     maps, alpha, info = composite(
-        gaussians.moved(-place), camera, channels,
+        replace(gaussians, means=gaussians.means - place), camera, channels,
         depth=render_depth, antialiased=antialiased, near=near, eps2d=eps2d,
     )  # fmt: skip
     depth = maps[..., -1:] / alpha.clamp_min(ALPHA_MIN / 2) if render_depth else None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import isqrt
 
 import torch
@@ -57,6 +57,12 @@ class Splats(Gaussians):
         """Return some of the Gaussians, chosen by a mask or by their indices (tensors or NumPy arrays)."""
         rows = torch.as_tensor(which, device=self.means.device)
         return self.mapped(lambda tensor: tensor[rows])
+
+    def thinned(self, most: int) -> Splats:
+        """Return at most this many of the Gaussians, evenly spaced, enlarged so that they cover as much."""
+        every = -(-len(self) // most)
+        some = self.select(torch.arange(0, len(self), every))
+        return replace(some, scales=some.scales * every**0.5)
 
     def sound(self) -> Bool[Tensor, " n"]:
         """Return which Gaussians have no NaN or infinite value."""

@@ -216,7 +216,8 @@ class TrainingData:
     # ── rounds ──────────────────────────────────────────────────────────────────────────────────────
 
     @cached_property
-    def _working(self) -> WorkingPhotos:
+    def working(self) -> WorkingPhotos:
+        """Reader of the photos, which keeps copies of large ones."""
         return WorkingPhotos(FeatureStore(self.cache_dir))
 
     @cached_property
@@ -225,7 +226,7 @@ class TrainingData:
         photos = [self.photos[name] for name in self.capture.split.train]
 
         def read(index: int) -> dict[str, Any]:
-            return read_data(photos[index], self._working, self.scale, targets)
+            return read_data(photos[index], self.working, self.scale, targets)
 
         return PhotoCache(read, machine_memory() / 4 if self.cache_gb is None else self.cache_gb * 1e9)
 
@@ -277,7 +278,7 @@ class TrainingData:
         targets, number, usable = self.targets, {name: i for i, name in enumerate(self.views)}, False
         for name in names:
             try:
-                data = read_data(self.photos[name], self._working, self.scale, targets)
+                data = read_data(self.photos[name], self.working, self.scale, targets)
             except PhotosGoneError:
                 raise
             except UserError as reason:

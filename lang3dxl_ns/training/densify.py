@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn import Parameter
 from torch.optim import Optimizer
@@ -114,13 +114,13 @@ class Densification:
             threshold = float(gradients.topk(room + 1).values[-1]) if room > 0 else float("inf")
         grows = gradients > threshold
         small = gaussians["scales"].exp().amax(1) <= self.large
-        twins, halves = (grows & small).nonzero()[:, 0], (grows & ~small).nonzero()[:, 0]
-        everyone = torch.arange(len(grows), device=grows.device)
+        splits, everyone = grows & ~small, torch.arange(len(grows), device=grows.device)
+        twins, halves = everyone[grows & small], everyone[splits]
         if len(twins):
             rearrange(gaussians, optimizers, state, everyone, twins)
         if len(halves):
             newest = torch.arange(len(grows), len(grows) + len(twins), device=grows.device)
-            kept = torch.cat((_others(everyone, halves), newest))
+            kept = torch.cat((everyone[~splits], newest))
             rearrange(gaussians, optimizers, state, kept, halves.repeat(2), _halved(gaussians, halves))
 
     def _prune(self, gaussians: Parameters, optimizers: Mapping[str, Optimizer], state: State) -> None:
@@ -137,12 +137,6 @@ class Densification:
             gone[opacities.topk(excess, largest=False).indices] = True
         kept = (~gone).nonzero()[:, 0]
         rearrange(gaussians, optimizers, state, kept, kept[:0])
-
-
-def _others(everyone: Int[Tensor, " n"], some: Int[Tensor, " m"]) -> Int[Tensor, " k"]:
-    kept: Bool[Tensor, " n"] = torch.ones_like(everyone, dtype=torch.bool)
-    kept[some] = False
-    return everyone[kept]
 
 
 def _halved(gaussians: Parameters, rows: Int[Tensor, " m"]) -> dict[str, Tensor]:

@@ -83,7 +83,7 @@ class Settings(RunSettings):
             rate.fit(self.steps)
             if schedule is not None:
                 schedule.total_steps = self.steps
-        learned = self.scene.learns_from_renderings
+        learned = self.scene.decoder.learns_from_renderings
         settle(self.targets, learned, not learned or self.scene.codes_from == "photos")
 
 
@@ -92,7 +92,7 @@ class Run:
 
     def __init__(self, capture: Capture, settings: Settings, folder: Path, cache_dir: Path, device: str):
         self.settings, self.folder, self.device = settings, folder, device
-        learned, scale = settings.scene.learns_from_renderings, settings.photo_scale
+        learned, scale = settings.scene.decoder.learns_from_renderings, settings.photo_scale
         self.data = TrainingData(capture, settings.targets, cache_dir, device, learned, scale)
         self.path = folder / f"{capture.folder.name or 'scene'}{SUFFIX}"
         self.start, self.words_are_learned, self.title = 0, False, self.path.stem

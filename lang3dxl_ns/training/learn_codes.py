@@ -23,8 +23,6 @@ from lang3dxl_ns.training.batches import TrainingData
 from lang3dxl_ns.training.sharpening import sharpen
 from lang3dxl_ns.training.state import PhotoCamera, Training
 
-ClipMaps = Callable[[], Iterable[Float[Tensor, "hd wd c"]]]
-DenseMaps = Callable[[], Iterable[Float[Tensor, "t t d"]]]
 DENSE_AXES = 32
 """Number of principal components of the dense features by which groups are formed."""
 LONGER_SIDE = 1_600
@@ -49,8 +47,9 @@ class TargetView:
 
 
 def begin_codes(run: Training, data: TrainingData) -> None:
-    """Let codes begin where the warm-up ends, from the photos' features if the settings say so."""
-    if run.codes_begin:
+    """Let codes begin where the warm-up ends, from the photos' features if the settings say so: once per run,
+    also if it is resumed or prolonged."""
+    if run.learns_from_renderings and run.warm_up_is_over and not run.codes_have_begun:
         if run.settings.codes_from == "photos":
             learn_words(run, data)
         run.codes_have_begun = True
@@ -91,8 +90,8 @@ def learn_codes(
     views: Iterable[TargetView],
     count: int,
     means: Float[Tensor, "n 3"],
-    clip_targets: ClipMaps,
-    dense_targets: DenseMaps | None = None,
+    clip_targets: Callable[[], Iterable[Float[Tensor, "hd wd c"]]],
+    dense_targets: Callable[[], Iterable[Float[Tensor, "t t d"]]] | None = None,
 ) -> Float[Tensor, "n code"]:
     """Average the photos' targets over the Gaussians that they show, and let the decoder learn codes, with
     progress bars and a line about what it learned.

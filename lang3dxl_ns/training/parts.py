@@ -31,8 +31,8 @@ _SHIFT_WEIGHT, _TURN_WEIGHT = 1e-2, 1e-3
 
 
 class CameraRefinement(nn.Module):
-    """A small motion of every training camera: a translation (world units), and a rotation vector (radians)
-    about the camera's center."""
+    """A small motion of every training camera, 0 at first: a translation (world units), and a rotation vector
+    (radians) about the camera's center."""
 
     def __init__(self, count: int) -> None:
         super().__init__()
@@ -81,11 +81,6 @@ class Semantics:
     clip_mean: Float[Tensor, " c"]
     dense_mean: Float[Tensor, " d"]
 
-    @property
-    def learned_from_renderings(self) -> bool:
-        """Whether semantics are trained with the scene instead of being gathered afterwards."""
-        return not self.decoder.needs_lifting
-
 
 @dataclass(frozen=True, eq=False)
 class Parts:
@@ -105,7 +100,7 @@ class Parts:
         refined = facts.wants("camera optimizer", settings.camera_optimization, False)
         return Parts(
             build_sky(settings, gaussians, extent) if settings.sky_gaussians > 0 and not lighting else None,
-            build_cameras(facts) if refined else None,
+            CameraRefinement(len(facts.names)) if refined else None,
             None if facts.statistics is None else build_semantics(settings, facts, gaussians, extent),
             build_looks(settings, facts, extent) if lighting else None,
         )
@@ -129,7 +124,7 @@ class Parts:
             groups["camera_opt"] = [self.cameras.pose_adjustment]
         if self.semantics is not None:
             groups |= self.semantics.decoder.parameter_groups()
-            if self.semantics.learned_from_renderings:
+            if not self.semantics.decoder.needs_lifting:
                 groups["downsampler"] = list(self.semantics.downsampler.parameters())
         if self.appearance is not None:
             groups["appearance_vectors"] = [self.appearance.vectors]
@@ -150,7 +145,7 @@ class Parts:
         device = gaussians["means"].device
         found = replace(self, sky=_matching_sky(self.sky, state, device))
         if "camera_optimizer.pose_adjustment" in state and self.cameras is None:
-            found = replace(found, cameras=build_cameras(facts).to(device))
+            found = replace(found, cameras=CameraRefinement(len(facts.names)).to(device))
         if "clip_mean" in state:
             semantics = _matching_semantics(self.semantics, state, settings, gaussians, extent)
             found = replace(found, semantics=semantics)
@@ -172,11 +167,6 @@ def build_sky(settings: TrainingSettings, gaussians: Parameters, extent: Extent)
     count = settings.sky_gaussians
     gaussians["opacities"].data[:count] = torch.logit(torch.tensor(OPACITY))
     return Sky(gaussians["means"].detach()[:count] - extent[0])
-
-
-def build_cameras(facts: SceneFacts) -> CameraRefinement:
-    """Build motions of the training cameras, all 0."""
-    return CameraRefinement(len(facts.names))
 
 
 def build_looks(settings: TrainingSettings, facts: SceneFacts, extent: Extent) -> AppearanceField:
@@ -238,11 +228,10 @@ def _matching_semantics(
     clip, dense, codes = state["clip_mean"], state["dense_mean"], state.get("gauss_params.codes")
     device = gaussians["means"].device
     if mine is None:
-        decoder = _decoder(settings, extent, len(clip), len(dense))
-        made = _with_codes(decoder, clip, dense, settings, gaussians)
-        mine = Semantics(
-            decoder.to(device), made.downsampler.to(device), clip.clone().to(device), dense.clone().to(device)
-        )
+        decoder = _decoder(settings, extent, len(clip), len(dense)).to(device)
+        means = clip.clone().to(device), dense.clone().to(device)
+        mine = _with_codes(decoder, *means, settings, gaussians)
+        mine.downsampler.to(device)
     if isinstance(mine.decoder, CompressedField) and codes is not None:
         mine.decoder.fit_codes(codes)
         mine.decoder.to(device)

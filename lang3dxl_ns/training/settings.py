@@ -113,11 +113,6 @@ class TrainingSettings(SceneSettings):
         if self.decode_size is None:
             self.decode_size = (round(56 + 24 * x), round(72 + 48 * x))
 
-    @property
-    def learns_from_renderings(self) -> bool:
-        """Whether semantics are trained with the scene instead of being gathered afterwards."""
-        return self.decoder.learns_from_renderings
-
 
 def as_printed(settings: TrainingSettings, targets: PreparationConfig) -> None:
     """Set what the paper prints or, where it is silent, what its authors released, in place;

@@ -106,11 +106,6 @@ class Training:
         return self.settings.rasterizer if self.gaussians["means"].is_cuda else "auto"
 
     @property
-    def antialiased(self) -> bool:
-        """Whether Gaussians smaller than a pixel are dimmed by what the screen-space blur adds to them."""
-        return self.settings.rasterize_mode == "antialiased"
-
-    @property
     def carried(self) -> Float[Tensor, "n d"] | None:
         """Semantic values that Gaussians carry; None if there are none (yet)."""
         return None if self.parts.semantics is None else self.parts.semantics.decoder.carried(self.gaussians)
@@ -118,23 +113,17 @@ class Training:
     @property
     def learns_from_renderings(self) -> bool:
         """Whether semantics are trained with the scene instead of being gathered afterwards."""
-        return self.parts.semantics is not None and self.parts.semantics.learned_from_renderings
+        return self.parts.semantics is not None and not self.parts.semantics.decoder.needs_lifting
 
     @property
     def learns_words_at_the_end(self) -> bool:
         """Whether semantics are gathered from the photos after the last iteration."""
-        return self.parts.semantics is not None and not self.parts.semantics.learned_from_renderings
+        return self.parts.semantics is not None and self.parts.semantics.decoder.needs_lifting
 
     @property
     def warm_up_is_over(self) -> bool:
         """Whether the present iteration trains more than colors."""
         return self.step >= self.settings.warm_up * self.settings.total_steps
-
-    @property
-    def codes_begin(self) -> bool:
-        """Whether codes are about to be trained for the first time. This is so once per run, also if the run
-        is resumed or prolonged."""
-        return self.learns_from_renderings and self.warm_up_is_over and not self.codes_have_begun
 
     @property
     def degree(self) -> int | None:
@@ -171,8 +160,8 @@ class Training:
             harmonics = harmonics_of(torch.sigmoid(g["features_dc"]))
         else:
             harmonics = of_training.harmonics(g)[:, : (self.degree + 1) ** 2]
-        gaussians = vars(of_training.activated(g))
-        return Splats(**gaussians, harmonics=harmonics, antialiased=self.antialiased, backend=self.backend)
+        gaussians, antialiased = vars(of_training.activated(g)), self.settings.rasterize_mode == "antialiased"
+        return Splats(**gaussians, harmonics=harmonics, antialiased=antialiased, backend=self.backend)
 
     def to(self, device: torch.device | str) -> None:
         """Move Gaussians and parts to a device, in place."""

@@ -54,7 +54,7 @@ def render(run: Training, view: PhotoCamera) -> Rendered:
         near = camera.detach().to(run.device)
         visible = in_view(near, gaussians.means, gaussians.scales).nonzero().squeeze(1)
         colors, in_photo = parts.appearance(gaussians, colors, vector, visible, run.step)
-    how: dict[str, Any] = {"backend": run.backend, "antialiased": run.antialiased}
+    how: dict[str, Any] = {"backend": run.backend, "antialiased": settings.rasterize_mode == "antialiased"}
     photo = rasterize(in_photo.seen_from(camera), camera, colors, background, **how)
     if photo.info["means2d"].requires_grad:
         photo.info["means2d"].retain_grad()  # densification reads it
@@ -66,7 +66,7 @@ def render(run: Training, view: PhotoCamera) -> Rendered:
     if settings.feature_gradient_to_geometry:
         gaussians = replace(gaussians, opacities=gaussians.opacities.detach())
     else:
-        gaussians, camera = gaussians.detach(), camera.detach()
+        gaussians, camera = gaussians.mapped(Tensor.detach), camera.detach()
     # A photo has many times the pixels that are decoded. The same ellipses are drawn at these alone.
     size = fitted_size((camera.height, camera.width), decoded_side(run))
     small, eps2d = at_fewer_pixels(camera, *size)
