@@ -54,6 +54,15 @@ _OF_PARTS: dict[str, dict[str, tuple[float, float]]] = {
 
 
 @dataclass
+class CameraRefinementConfig:
+    """Settings that nothing reads. The config.yml of every run until commit 1b7f663 has them."""
+
+    mode: str = "off"
+    trans_l2_penalty: float = 1e-2
+    rot_l2_penalty: float = 1e-3
+
+
+@dataclass
 class TrainingSettings(SceneSettings):
     """Settings of Gaussians, their parts, losses and schedules."""
 

@@ -1,5 +1,6 @@
 """Loading a scene from a run's folder alone."""
 
+import re
 import shutil
 from dataclasses import replace
 from math import isqrt
@@ -258,6 +259,20 @@ def test_a_run_of_a_version_without_some_settings_can_be_asked(trainer, tmp_path
     config.write_text(
         "".join(line for line in lines if not line.strip().startswith(("code_rate:", "unseen:")))
     )
+    assert lang3dxl_ns.load_scene(config).query("dome").relevancy.any()
+
+
+def test_a_run_of_a_version_with_a_setting_that_has_gone_can_be_asked(trainer, tmp_path):
+    shutil.copytree(trainer.base_dir, tmp_path / "run")
+    config = tmp_path / "run" / "config.yml"
+    text = config.read_text()
+    gone = "    camera_optimizer: !!python/object:lang3dxl_ns.training.settings.CameraRefinementConfig\n"
+    gone += "      mode: 'off'\n      rot_l2_penalty: 0.001\n      trans_l2_penalty: 0.01\n"
+    text, count = re.subn(
+        r"^    camera_optimizer: .*?\n(?=    \S)", gone, text, flags=re.MULTILINE | re.DOTALL
+    )
+    assert count == 1
+    config.write_text(text)
     assert lang3dxl_ns.load_scene(config).query("dome").relevancy.any()
 
 
