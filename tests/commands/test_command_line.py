@@ -38,7 +38,7 @@ def test_without_words_the_help_is_shown(capsys):
     ("words", "hint"),
     [
         (["qeury"], "did you mean query"),
-        (["benchmark", "trainig"], "did you mean training"),
+        (["benchmark", "ablatoin"], "did you mean ablation"),
         (["xyzzy"], "--help lists all"),
         (["query", "none", "--out", "found"], "there is no --text"),
         (["query", "none", "--text", " ; ", "--out", "found"], "the prompt is empty"),
