@@ -16,8 +16,14 @@ from lang3dxl_ns.common.errors import UserError, readable
 from lang3dxl_ns.common.files import read_json
 from lang3dxl_ns.common.reports import markdown_table
 
-PREFIXES = {"": "blurred", "raw_": "unprocessed", "authors_": "as published"}
-PREFIXES |= {"teacher_": "2-D teacher", "limit_": "limit", "chance_": "chance"}
+PREFIXES = {
+    "": "blurred",
+    "raw_": "unprocessed",
+    "authors_": "as published",
+    "teacher_": "2-D teacher",
+    "limit_": "limit",
+    "chance_": "chance",
+}
 """Prefixes of scored maps, and their names in reports: the field's maps, the same unblurred or processed as
 published, the 2D teacher's, the lifted labels', and maps without information."""
 TOTALS = {

@@ -51,8 +51,11 @@ _DIM = 0.75
 _DARKEST = 0.02
 """Lower bound on a photo's mean brightness, so that black photos stay black and exponents stay moderate."""
 _VOCABULARIES = (
-    *("tokenizer.json", "vocab.json and merges.txt", "spiece.model", "sentencepiece.bpe.model"),
-    "tokenizer.model",
+    ("tokenizer.json",),
+    ("vocab.json", "merges.txt"),
+    ("spiece.model",),
+    ("sentencepiece.bpe.model",),
+    ("tokenizer.model",),
 )
 """Files of which a tokenizer needs one set."""
 
@@ -239,11 +242,11 @@ def _tokenizer(files: ModelFiles) -> Any:
     """Load a model's tokenizer. Raises UserError if its files are missing or can't be read."""
     from transformers import AutoTokenizer
 
-    if not any(has_files(files.folder, *names.split(" and ")) for names in _VOCABULARIES):
+    if not any(has_files(files.folder, *names) for names in _VOCABULARIES):
         # transformers would silently make a tokenizer without words
         raise UserError(
-            f"{files.folder} has no tokenizer ({', '.join(_VOCABULARIES)}): copy these files from the model "
-            "that this one was fine-tuned from"
+            f"{files.folder} has no tokenizer ({', '.join(' and '.join(names) for names in _VOCABULARIES)}): "
+            "copy these files from the model that this one was fine-tuned from"
         )
     remedy = "SigLIP and TIPSv2 need `pip install sentencepiece protobuf`; otherwise download the model again"
     with whole(f"the tokenizer in {files.folder} can't be read", remedy):

@@ -123,9 +123,13 @@ def load_weights(model_class: Any, files: ModelFiles, device: torch.device | str
     read_config(files)
     remedy = f"download it again, or give {data_option(files.option)} another folder"
     with whole(f"{files.name}: the model in {files.folder} can't be loaded", remedy):
-        safely = {"local_files_only": True, "trust_remote_code": False}
-        how = {"dtype": torch.float32, "output_loading_info": True}
-        model, report = model_class.from_pretrained(files.folder, **safely, **how)
+        model, report = model_class.from_pretrained(
+            files.folder,
+            local_files_only=True,
+            trust_remote_code=False,
+            dtype=torch.float32,
+            output_loading_info=True,
+        )
     missing = sorted(name for name in report["missing_keys"] if "pooler" not in name)  # poolers are not used
     if missing:
         raise UserError(

@@ -36,8 +36,12 @@ _BOX_THRESHOLD = 0.3
 """Minimum confidence of a box (LangSAM's)."""
 # These are LangSplat's settings of SAM's automatic masks, published for language fields. Its extra round over
 # crops of the photo is omitted: it takes five times as long and finds masks too small for the label maps.
-_AUTOMATIC = {"points_per_crop": 32, "crops_nms_thresh": 0.7}
-_AUTOMATIC |= {"pred_iou_thresh": 0.7, "stability_score_thresh": 0.85}
+_AUTOMATIC = {
+    "points_per_crop": 32,
+    "pred_iou_thresh": 0.7,
+    "stability_score_thresh": 0.85,
+    "crops_nms_thresh": 0.7,
+}
 
 
 class TextSegmenter(Protocol):

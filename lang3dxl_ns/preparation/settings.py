@@ -22,8 +22,13 @@ DENSE_MODEL = "facebook/dinov2-small"
 """Dense encoder for semantics that are trained with the scene."""
 
 
-_BOUNDS = {"longer_side": (16, 1 << 16), "scales": (1, 100), "dense_tokens": (1, 1024)}
-_BOUNDS |= {"crop_batch": (1, 1 << 16), "workers": (1, 1024)}
+_BOUNDS = {
+    "longer_side": (16, 1 << 16),
+    "scales": (1, 100),
+    "dense_tokens": (1, 1024),
+    "crop_batch": (1, 1 << 16),
+    "workers": (1, 1024),
+}
 
 
 @dataclass

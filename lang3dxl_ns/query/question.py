@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -28,8 +27,14 @@ from lang3dxl_ns.rendering import Rendering
 
 COVERED = 0.3
 """Share of a pixel that matching Gaussians must cover; below 0.5, because most are small and edges blend."""
-_BOUNDS = {"temperature": (1e-3, 1e4), "threshold": (0, 1), "min_alpha": (0, 1)}
-_BOUNDS |= {"size": (1, 1 << 16), "views": (1, 1e6), "view_side": (8, 8192)}
+_BOUNDS = {
+    "temperature": (1e-3, 1e4),
+    "threshold": (0, 1),
+    "min_alpha": (0, 1),
+    "size": (1, 1 << 16),
+    "views": (1, 1e6),
+    "view_side": (8, 8192),
+}
 
 
 @showing("threshold", "foreground")
@@ -105,9 +110,15 @@ class Question:
         """Return the question of one of these prompts."""
         count, one = len(self.prompts), slice(row, row + 1)
         rows = [row, *range(count, len(self.everywhere))]
-        of_prompts = ("prompts", "doubts", "trusts", "thresholds")
-        kept: dict[str, Any] = {name: getattr(self, name)[one] for name in of_prompts}
-        return replace(self, queries=self.queries.select(rows), everywhere=self.everywhere[rows], **kept)
+        return replace(
+            self,
+            prompts=self.prompts[one],
+            queries=self.queries.select(rows),
+            everywhere=self.everywhere[rows],
+            doubts=self.doubts[one],
+            trusts=self.trusts[one],
+            thresholds=self.thresholds[one],
+        )
 
     @torch.no_grad()
     def maps(

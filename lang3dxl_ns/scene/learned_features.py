@@ -31,7 +31,7 @@ ALIKE = 0.82
 LEAST_ALIKE = 20
 """Possible matches from which a pair of photos is matched."""
 PARTNERS, NEIGHBORS = 12, 40
-"""Photos with the most possible matches that each photo is matched with at least."""
+"""Photos that each photo is matched with at least, those with the most possible matches, and at most."""
 KEPT = "xfeat"
 """Folder of descriptors, beside the database."""
 _MULTIPLE = 32

@@ -148,11 +148,11 @@ def match(
         learned = LearnedMatcher(database, known) if settings.features == "xfeat" else None
         pairs = learned.pairs() if learned else pairs_to_match(known, lambda name: largest(db, ids[name]))
     tried: set[tuple[str, str]] = set()
-    for _ in range(1 if learned else 1 + ROUNDS):
+    for further in range(1 if learned else 1 + ROUNDS):
+        if further:  # without what an interrupted attempt also tried, with which other pairs would share most
+            pairs = pairs_that_share(known, tried, tried & _matched(database))
         _match_pairs(database, [pair for pair in pairs if not new.isdisjoint(pair)], settings, learned)
-        tried.update(pairs)  # not what an interrupted attempt also tried: its rounds would be others
-        if not (pairs := pairs_that_share(known, tried, tried & _matched(database))):
-            break
+        tried.update(pairs)
 
 
 def _match_pairs(
@@ -167,6 +167,8 @@ def _match_pairs(
         ids = {image.name: image.image_id for image in db.read_all_images()}
         has = db.exists_matches, db.exists_two_view_geometry
         missing = [(a, b) for a, b in pairs if not all(there(ids[a], ids[b]) for there in has)]
+    if not missing:
+        return
     guided = settings.features == "dsp-sift"
     options = pycolmap.FeatureMatchingOptions(num_threads=_threads(5e8), guided_matching=guided)
     listed = database.with_name("pairs.txt")
