@@ -106,6 +106,11 @@ class Training:
         return self.settings.rasterizer if self.gaussians["means"].is_cuda else "auto"
 
     @property
+    def antialiased(self) -> bool:
+        """Whether Gaussians smaller than a pixel are dimmed by what the screen-space blur adds to them."""
+        return self.settings.rasterize_mode == "antialiased"
+
+    @property
     def carried(self) -> Float[Tensor, "n d"] | None:
         """Semantic values that Gaussians carry; None if there are none (yet)."""
         return None if self.parts.semantics is None else self.parts.semantics.decoder.carried(self.gaussians)
@@ -160,8 +165,8 @@ class Training:
             harmonics = harmonics_of(torch.sigmoid(g["features_dc"]))
         else:
             harmonics = of_training.harmonics(g)[:, : (self.degree + 1) ** 2]
-        gaussians, antialiased = vars(of_training.activated(g)), self.settings.rasterize_mode == "antialiased"
-        return Splats(**gaussians, harmonics=harmonics, antialiased=antialiased, backend=self.backend)
+        gaussians = vars(of_training.activated(g))
+        return Splats(**gaussians, harmonics=harmonics, antialiased=self.antialiased, backend=self.backend)
 
     def to(self, device: torch.device | str) -> None:
         """Move Gaussians and parts to a device, in place."""

@@ -54,7 +54,7 @@ def render(run: Training, view: PhotoCamera) -> Rendered:
         near = camera.detach().to(run.device)
         visible = in_view(near, gaussians.means, gaussians.scales).nonzero().squeeze(1)
         colors, in_photo = parts.appearance(gaussians, colors, vector, visible, run.step)
-    how: dict[str, Any] = {"backend": run.backend, "antialiased": settings.rasterize_mode == "antialiased"}
+    how: dict[str, Any] = {"backend": run.backend, "antialiased": run.antialiased}
     photo = rasterize(in_photo.seen_from(camera), camera, colors, background, **how)
     if photo.info["means2d"].requires_grad:
         photo.info["means2d"].retain_grad()  # densification reads it
