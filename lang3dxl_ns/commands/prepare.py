@@ -33,7 +33,8 @@ class Reconstruct(ReconstructionSettings):
     cache_dir: Path | None = None
     """Folder for features and matches (default: lang3dxl_cache inside the data folder)."""
     add: Path | None = None
-    """Folder of new photos for the model that the data folder has, whose cameras and points stay."""
+    """Folder of new photos, or a video, for the model that the data folder has, whose cameras and points
+    stay."""
 
     def main(self) -> None:
         from lang3dxl_ns.scene.reconstruct import reconstruct_scene

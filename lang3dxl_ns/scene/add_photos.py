@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float, Int64
 from numpy import ndarray as Array
+from scipy.sparse import csr_array, triu
 from scipy.spatial import KDTree
 
 from lang3dxl_ns.common.console import say
@@ -32,7 +33,7 @@ from lang3dxl_ns.scene.companions import cache_folder, inside
 from lang3dxl_ns.scene.layout import find_model, has_model, images_folder
 from lang3dxl_ns.scene.matching import extract, feature_database, match, numbered, quiet, usable
 from lang3dxl_ns.scene.photo_folder import PhotoFolder, find_photos, shared_cameras
-from lang3dxl_ns.scene.placements import doubtful_placements, matched_pairs
+from lang3dxl_ns.scene.placements import LEAST_MATCHES, doubtful_placements, matched_pairs
 from lang3dxl_ns.scene.reconstruct import check_settings, write_picture
 from lang3dxl_ns.scene.reconstruction import (
     REPORT,
@@ -41,6 +42,7 @@ from lang3dxl_ns.scene.reconstruction import (
     picture_line,
     reasons_in_words,
 )
+from lang3dxl_ns.scene.video import extract_frames, is_video
 
 if TYPE_CHECKING:
     import pycolmap
@@ -76,17 +78,21 @@ def add_photos(
 
     Photos that find a place are copied to a folder of the same name beside the scene's. The model as it was
     is kept in the cache. Raises UserError without a model, its photos or new ones, for names that are taken,
-    and if no photo finds a place.
+    for a mapper, since none runs, and if no photo finds a place.
 
     Args:
         data: the scene's folder, with photos and a COLMAP model.
-        folder: new photos; may lie among the scene's.
+        folder: new photos, or a video; may lie among the scene's.
         cache_dir: folder for features and matches; by default lang3dxl_cache in `data`.
-        settings: as for `reconstruct`; the mapper has no meaning here, and features "auto" are plain SIFT's.
+        settings: as for `reconstruct`; features "auto" are plain SIFT's.
     """
     settings = settings or ReconstructionSettings()
     check_settings(settings)
+    if settings.mapper != "incremental":
+        raise UserError("--add places photos without a mapper: leave out --mapper")
     data, folder = expanded(data).absolute(), expanded(folder).absolute()
+    if is_video(folder):
+        folder = extract_frames(folder)
     cache = cache_folder(data, cache_dir).absolute()
     work = cache / REPORT.parent
     place = find_model(data) or work / "sparse" / "0"
@@ -99,8 +105,10 @@ def add_photos(
         database = feature_database(good, copies, adding, settings)
         extract(database, copies, settings)
         number = dict(zip(good.names, copies.names, strict=True))
-        match(database, copies.names, settings, {number[name] for name in targets if name in number})
         model = load_pycolmap().Reconstruction(place)
+        new = {number[name] for name in targets if name in number}
+        known = {(number[a], number[b]) for a, b in _pairs_of(model) if a in number and b in number}
+        match(database, copies.names, settings, new, known)
         with load_pycolmap().Database.open(database) as db:
             ids = {name: db.read_image_with_name(number[name]).image_id for name in good.names}
             scene = _Scene(model, db, {ids[name]: name for name in good.names}, good)
@@ -121,7 +129,7 @@ def add_photos(
         model.extract_colors_for_image(image, images)  # only of points without a color
     kept = _replace(place, model, work)
     write_picture(model, doubtful | doubtful_photos(cache), work)
-    _report(work / REPORT.name, len(targets), len(found), doubtful)
+    _report(work / REPORT.name, model, lost, doubtful)
     say(f"{len(found)} of {len(targets)} new photos have a pose; the model as it was is in {kept}", *told)
     say(picture_line(work))
     return place
@@ -140,6 +148,22 @@ def _photos_of(data: Path, place: Path) -> tuple[Path, list[str]]:
         if not os.access(written, os.W_OK):
             raise UserError(f"{written} can't be written to: copy the scene to where it can")
     return images, old
+
+
+def _pairs_of(model: pycolmap.Reconstruction) -> set[tuple[str, str]]:
+    """List the pairs of photos that show enough points of a model together, each in the order of names."""
+    names = sorted(image.name for image in model.images.values())
+    row = {name: i for i, name in enumerate(names)}
+    seen = [(row[i.name], p.point3D_id) for i in model.images.values() for p in i.points2D if p.has_point3D()]
+    if not seen:
+        return set()
+    photos, points = np.array(seen, np.int64).T
+    points = np.unique(points, return_inverse=True)[1]
+    shows = csr_array((np.ones(len(seen), np.int32), (photos, points)))
+    shared = triu(shows @ shows.T, k=1).tocoo()
+    enough = shared.data >= LEAST_MATCHES
+    found = zip(shared.row[enough].tolist(), shared.col[enough].tolist(), strict=True)
+    return {(names[i], names[j]) for i, j in found}
 
 
 def _copy(images: Path, targets: Mapping[str, str]) -> None:
@@ -341,12 +365,17 @@ def _triangulate(
     pycolmap.ObservationManager(model, matches).filter_points3D(*_SOUND, set(model.points3D) - known)
 
 
-def _report(path: Path, photos: int, placed: int, doubtful: dict[str, str]) -> None:
-    """Update the model's report, if it has one: doubtful photos are asked for there."""
+def _report(
+    path: Path, model: pycolmap.Reconstruction, lost: dict[str, str], doubtful: dict[str, str]
+) -> None:
+    """Update the model's report, if it has one: doubtful photos are asked for there. `lost` are new photos
+    without a place, with reasons."""
+    placed = {image.name for image in model.images.values() if image.has_pose}
     with suppress(*DAMAGE):
         told = read_json(path)
-        told["photos"] += photos
-        told["registered"] += placed
+        told["left_out"] = {n: why for n, why in (told["left_out"] | lost).items() if n not in placed}
+        told["registered"], told["points"] = len(placed), model.num_points3D()
+        told["photos"] = len(placed) + len(told["left_out"])
         told["doubtful"] |= doubtful
         replace_file(path, json.dumps(told, indent=2))
 

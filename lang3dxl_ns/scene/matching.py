@@ -137,10 +137,21 @@ def extract(database: Path, photos: PhotoFolder, settings: ReconstructionSetting
 
 
 def match(
-    database: Path, names: Sequence[str], settings: ReconstructionSettings, new: Collection[str] | None = None
+    database: Path,
+    names: Sequence[str],
+    settings: ReconstructionSettings,
+    new: Collection[str] | None = None,
+    matched: Collection[tuple[str, str]] = (),
 ) -> None:
-    """Find and verify the matches of pairs that are missing in the database, only those with one of `new`
-    where that is given."""
+    """Find and verify the matches of pairs that are missing in the database.
+
+    Args:
+        database: COLMAP's database with the photos' features.
+        names: the photos, in the order of a walk where there is one.
+        settings: as for `reconstruct`.
+        new: photos of which each pair must have one; all by default.
+        matched: pairs of other photos that are known to match.
+    """
     new = set(names if new is None else new)
     with load_pycolmap().Database.open(database) as db:
         ids = {image.name: image.image_id for image in db.read_all_images()}
@@ -150,7 +161,7 @@ def match(
     tried: set[tuple[str, str]] = set()
     for further in range(1 if learned else 1 + ROUNDS):
         if further:  # without what an interrupted attempt also tried, with which other pairs would share most
-            pairs = pairs_that_share(known, tried, tried & _matched(database))
+            pairs = pairs_that_share(known, tried, (tried & _matched(database)).union(matched))
         _match_pairs(database, [pair for pair in pairs if not new.isdisjoint(pair)], settings, learned)
         tried.update(pairs)
 

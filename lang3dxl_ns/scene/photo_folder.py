@@ -9,8 +9,9 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from PIL import ExifTags
+from PIL import ExifTags, Image
 
+from lang3dxl_ns.common.console import tracked
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import expanded
 from lang3dxl_ns.common.pictures import (
@@ -84,18 +85,20 @@ def shared_cameras(photos: PhotoFolder) -> list[list[str]]:
 
 
 def readable(photos: PhotoFolder) -> tuple[PhotoFolder, dict[str, str]]:
-    """Separate the photos with a readable header from the others, for which reasons are given."""
+    """Separate the photos that can be decoded from the others, for which reasons are given."""
     good, bad = [], {}
-    for name in photos.names:
+    for name in tracked(photos.names, "photos read"):
         path = photos.folder / name
         if reason := unreadable(path):
             bad[name] = reason
             continue
         try:
             with open_picture(path) as image:
-                image.load() if image.format == "GIF" else image.verify()  # which reads nothing of a GIF
-            if _is_panorama(path):  # opened again: a verified picture tells nothing more
-                bad[name] = "a panorama, which no lens takes: use single photos, or cut views out of it"
+                image.draft("L", (100, 100))  # a JPEG is decoded to its end, in an eighth of the time
+                image.load()
+                panorama = _is_panorama(image)
+            if panorama:
+                bad[name] = "a panorama, which no single lens takes: use single photos, or cut out views"
             else:
                 good.append(name)
         except (OSError, NoPictureError) as error:
@@ -103,18 +106,17 @@ def readable(photos: PhotoFolder) -> tuple[PhotoFolder, dict[str, str]]:
     return PhotoFolder(photos.folder, tuple(good)), bad
 
 
-def _is_panorama(path: Path) -> bool:
-    """Return whether a picture is a panorama: by its note for viewers of spheres, by a phone's, or since it
-    is wider than any lens takes."""
-    with open_picture(path) as image:
-        note = image.info.get("xmp", b"")
-        if b"GPano:ProjectionType" in (note.encode() if isinstance(note, str) else note):
+def _is_panorama(image: Image.Image) -> bool:
+    """Return whether an open picture is a panorama: by its note for viewers of spheres, by a phone's, or
+    since it is wider than any lens takes."""
+    note = image.info.get("xmp", b"")
+    if b"GPano:ProjectionType" in (note.encode() if isinstance(note, str) else note):
+        return True
+    with suppress(Exception):  # damaged EXIF, which may hold anything
+        details = image.getexif().get_ifd(ExifTags.IFD.Exif)
+        if details.get(ExifTags.Base.CustomRendered) == _PHONE_PANORAMA:
             return True
-        with suppress(Exception):  # damaged EXIF, which may hold anything
-            details = image.getexif().get_ifd(ExifTags.IFD.Exif)
-            if details.get(ExifTags.Base.CustomRendered) == _PHONE_PANORAMA:
-                return True
-        return max(image.size) > _WIDEST * min(image.size)
+    return max(image.size) > _WIDEST * min(image.size)
 
 
 def photos_below(folder: Path) -> list[str]:

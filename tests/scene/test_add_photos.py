@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 
 import numpy as np  # before pycolmap
 import pycolmap
@@ -11,9 +12,11 @@ from scenes import CENTER, HALF_SIZES, speckled, write_scene
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.scene import add_photos as module
+from lang3dxl_ns.scene import pairing
 from lang3dxl_ns.scene.add_photos import add_photos
 from lang3dxl_ns.scene.colmap import read_reconstruction
 from lang3dxl_ns.scene.photo_folder import find_photos
+from lang3dxl_ns.scene.placements import LEAST_MATCHES
 from lang3dxl_ns.scene.reconstruct import reconstruct_scene
 from lang3dxl_ns.scene.reconstruction import ReconstructionSettings, doubtful_photos
 
@@ -127,8 +130,60 @@ def test_the_report_and_the_picture_know_the_new_photos(scene, monkeypatch):
     add_photos(scene / "data", scene / "late", None, SIFT)
     added = {f"late/{name}": "it looks away" for name in LATE}
     assert doubtful_photos(work.parent) == doubted | added
-    assert json.loads((work / "report.json").read_text())["registered"] == 7
     assert (work / "cameras.png").read_bytes() != before
+
+
+def test_the_report_counts_each_photo_once_however_often_it_is_added(scene):
+    report = scene / "data/lang3dxl_cache/reconstruction/report.json"
+    noise = np.random.default_rng(0).integers(0, 255, (180, 240, 3), np.uint8)
+    Image.fromarray(noise).save(scene / "late" / "noise.jpg")
+    shutil.move(scene / "late" / LATE[1], scene / LATE[1])
+    for number in (6, 7):
+        model = pycolmap.Reconstruction(add_photos(scene / "data", scene / "late", None, SIFT))
+        told = json.loads(report.read_text())
+        assert told["registered"] == number
+        assert told["points"] == model.num_points3D()
+        assert set(told["left_out"]) == {"late/noise.jpg"}
+        assert told["photos"] == number + 1
+        shutil.copy(scene / LATE[1], scene / "late")
+
+
+def test_photos_that_share_points_are_pairs(made):
+    """As counted pair by pair; of large collections, they tell which photos a new one's partners match."""
+    model = pycolmap.Reconstruction(made / "data/sparse/0")
+    shown = {
+        image.name: {point.point3D_id for point in image.points2D if point.has_point3D()}
+        for image in model.images.values()
+    }
+    names = sorted(shown)
+    shared = {(a, b): len(shown[a] & shown[b]) for a in names for b in names if a < b}
+    assert module._pairs_of(model) == {pair for pair, count in shared.items() if count >= LEAST_MATCHES}
+    assert len(module._pairs_of(model)) > 4
+
+
+def test_in_large_collections_new_photos_are_tried_with_their_partners_partners(scene, monkeypatch):
+    monkeypatch.setattr(pairing, "EXHAUSTIVE", 0)
+    monkeypatch.setattr(pairing, "ALIKE", 1)
+    tried, matched = set(), pycolmap.match_image_pairs
+
+    def noted(database, options, pairs):
+        tried.update(pairs.match_list_path.read_text().splitlines())
+        matched(database, options, pairs)
+
+    monkeypatch.setattr(pycolmap, "match_image_pairs", noted)
+    add_photos(scene / "data", scene / "late", None, SIFT)
+    assert len(tried) == 2 * 5 + 1  # of these, looks and names alone give 8
+
+
+def test_frames_of_a_video_are_added(scene, monkeypatch):
+    (scene / "walk.mp4").write_bytes(b"")
+    monkeypatch.setattr(module, "extract_frames", lambda video: scene / "late")
+    assert len(contents(add_photos(scene / "data", scene / "walk.mp4", None, SIFT))[0]) == 7
+
+
+def test_a_mapper_has_nothing_to_do(scene):
+    with pytest.raises(UserError, match="leave out --mapper"):
+        add_photos(scene / "data", scene / "late", None, replace(SIFT, mapper="global"))
 
 
 def test_the_model_as_it_was_is_kept(scene):

@@ -142,3 +142,16 @@ def test_large_collections_are_matched_with_neighbors_alone(monkeypatch):
     pairs = pairs_to_match(names, described.__getitem__)
     assert len(set(pairs)) == len(pairs) < 60 * (20 + 4)
     assert set(pairwise(names)) <= set(pairs)
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".png", ".webp", ".tif", ".bmp", ".gif"])
+@pytest.mark.parametrize("kept", [0.5, 0.95])
+def test_a_photo_that_was_not_copied_to_its_end_is_named(tmp_path, suffix, kept):
+    noise = np.random.default_rng(0).integers(0, 255, (120, 160, 3), np.uint8)
+    for name in (f"whole{suffix}", f"cut{suffix}"):
+        Image.fromarray(noise).save(tmp_path / name)
+    content = (tmp_path / f"cut{suffix}").read_bytes()
+    (tmp_path / f"cut{suffix}").write_bytes(content[: int(kept * len(content))])
+    good, bad = readable(find_photos(tmp_path))
+    assert good.names == (f"whole{suffix}",)
+    assert "damaged" in bad[f"cut{suffix}"]

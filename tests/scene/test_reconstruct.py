@@ -121,6 +121,12 @@ def test_stronger_features_are_tried_where_plain_ones_leave_photos_without_a_pos
     assert asked == [("sift", tmp_path), ("dsp-sift", tmp_path / "dsp-sift")][: 1 + tried]
 
 
+def test_of_many_photos_without_a_pose_the_way_to_more_is_told(tmp_path, capsys):
+    plain = module._Mapping(tmp_path, [SimpleNamespace(num_reg_images=lambda: 80)], [object()], set())
+    assert module._best_mapping(lambda *_: plain, 101, tmp_path, ReconstructionSettings()) is plain
+    assert "80 of 101" in (told := capsys.readouterr().out) and "--features dsp-sift" in told
+
+
 def test_what_matches_measure_agrees_with_the_model(reconstructed):
     """Else an honest model would be doubted; and a photo that is turned in it is."""
     data, model, _ = reconstructed
@@ -352,7 +358,8 @@ def picture(folder, count, paint):
     ("count", "paint", "message"),
     [
         (0, None, "neither photos nor a COLMAP model"),
-        (1, lambda i: np.full((60, 80, 3), i, np.uint8), "one photo"),
+        (1, lambda i: np.full((60, 80, 3), i, np.uint8), "only one photo"),
+        (2, lambda i: np.full((60, 80, 3), i, np.uint8), "only two photos"),
         (4, lambda i: np.full((60, 80, 3), 9, np.uint8), "the same file as 0.png"),
         (3, lambda i: np.full((60, 80, 3), i, np.uint8), "hardly any detail"),
         (
@@ -361,7 +368,7 @@ def picture(folder, count, paint):
             "show the same thing",
         ),
     ],
-    ids=["none", "one", "the same", "blank", "no overlap"],
+    ids=["none", "one", "two", "the same", "blank", "no overlap"],
 )
 def test_what_makes_no_scene_is_told_in_words(tmp_path, count, paint, message):
     with pytest.raises(UserError, match=message):
