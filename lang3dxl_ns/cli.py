@@ -179,7 +179,8 @@ def _choice(commands: Mapping[str, Any], words: Sequence[str]) -> Any:
             group = isinstance(place, Mapping)
             kind = _choice(place, words[1:]) if group else settings_of(place)
             described = summary if group else None
-        kinds.append(Annotated[kind, tyro.conf.subcommand(name, description=described)])
+        usual = {"default": kind.usual(words[1:])} if hasattr(kind, "usual") else {}
+        kinds.append(Annotated[kind, tyro.conf.subcommand(name, description=described, **usual)])
     return reduce(operator.or_, kinds)
 
 

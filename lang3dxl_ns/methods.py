@@ -18,7 +18,8 @@ from lang3dxl_ns.plugin.run_settings import check_command_line
 from lang3dxl_ns.plugin.trainer_config import Lang3DXLTrainerConfig
 from lang3dxl_ns.plugin.wrong_flags import name_wrong_flags
 from lang3dxl_ns.training.learning_rates import Rates, learning_rates, printed_learning_rates
-from lang3dxl_ns.training.settings import PRINTED_PHOTO_SCALE, as_printed
+from lang3dxl_ns.training.scene_settings import PRINTED_PHOTO_SCALE
+from lang3dxl_ns.training.settings import as_printed
 
 check_command_line(sys.argv[1:])
 atexit.register(end_at_once)  # before the handlers of torch, which was imported earlier

@@ -173,7 +173,9 @@ class Demo:
         from lang3dxl_ns.preparation.settings import PreparationConfig
 
         steps = self.steps or (250 if self.quick else 1_200)
-        usual = Train(
+        words = shlex.split(self.train)
+        usual = Train.usual(
+            words,
             data=out / "scene",
             out=out,
             steps=steps,
@@ -183,7 +185,7 @@ class Demo:
             foreground="none",  # score every pixel, also of sky and people
             dense_tokens=32 if self.quick else PreparationConfig.dense_tokens,
         )
-        settings = tyro.cli(Train, args=shlex.split(self.train), default=usual).settings()
+        settings = tyro.cli(Train, args=words, default=usual).settings()
         if self.quick:
             settings.scene.decoder.compression.steps = 300
         settings.resolve()

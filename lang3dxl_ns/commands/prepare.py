@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.settings_help import showing
 from lang3dxl_ns.preparation.settings import PreparationConfig
+from lang3dxl_ns.scene.capture_settings import CaptureSettings
 from lang3dxl_ns.scene.reconstruction import ReconstructionSettings
 
 if TYPE_CHECKING:
@@ -50,7 +51,7 @@ class Reconstruct(ReconstructionSettings):
 
 @showing("data", "clip", "quality", "foreground", "workers", "cache_dir")
 @dataclass(kw_only=True)
-class Prepare(PreparationConfig):
+class Prepare(PreparationConfig, CaptureSettings):
     """Make the targets that training learns from, in advance.
 
     They are CLIP features of crops in physical scale, and dense features. Training makes missing targets
@@ -76,7 +77,7 @@ class Prepare(PreparationConfig):
 
 @showing("data", "clip")
 @dataclass(kw_only=True)
-class Needs(PreparationConfig):
+class Needs(PreparationConfig, CaptureSettings):
     """Measure a scene's needs without training: which optional components will be built, and why.
 
     Training measures the same, and applies it to every component left at "auto".
@@ -94,7 +95,7 @@ class Needs(PreparationConfig):
         print(table)
 
 
-def _opened(settings: PreparationConfig, data: Path) -> TrainingData:
+def _opened(settings: Prepare | Needs, data: Path) -> TrainingData:
     """Open a folder of photos with these settings, which are resolved. Nothing is prepared yet."""
     from lang3dxl_ns.common.device import best_device
     from lang3dxl_ns.scene.capture import open_capture, say_left_out
@@ -102,7 +103,7 @@ def _opened(settings: PreparationConfig, data: Path) -> TrainingData:
     from lang3dxl_ns.training.batches import TrainingData, settle
 
     settings.check()
-    capture = open_capture(data, cache_dir=settings.cache_dir)
+    capture = open_capture(data, settings, settings.cache_dir)
     say_left_out(capture)
     learned = settings.crops == "pyramid" or settings.regions not in ("auto", "none")
     settle(settings, learned, gathered=not learned)

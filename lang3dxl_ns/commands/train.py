@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import shlex
-from dataclasses import MISSING, dataclass, fields
+from argparse import ArgumentParser
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -12,7 +14,15 @@ import tyro
 from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.settings_help import showing, without
 from lang3dxl_ns.preparation.settings import PreparationConfig
-from lang3dxl_ns.training.scene_settings import RunSettings, SceneSettings
+from lang3dxl_ns.scene.capture_settings import CaptureSettings
+from lang3dxl_ns.training.scene_settings import (
+    PRINTED_LOOKS,
+    PRINTED_PHOTO_SCALE,
+    Method,
+    RunSettings,
+    SceneSettings,
+    plain_as_printed,
+)
 
 if TYPE_CHECKING:
     from lang3dxl_ns.training.fit import Settings
@@ -24,7 +34,7 @@ if TYPE_CHECKING:
 )
 @without("total_steps")
 @dataclass(kw_only=True)
-class Train(RunSettings, SceneSettings, PreparationConfig):
+class Train(RunSettings, SceneSettings, PreparationConfig, CaptureSettings):
     """Train a scene from photos: Gaussians with colors, and words for them.
 
     Photos without a COLMAP model or a transforms.json are reconstructed first. A run that was stopped, by
@@ -35,15 +45,15 @@ class Train(RunSettings, SceneSettings, PreparationConfig):
     """Folder of photos, or a video."""
     out: Path | None = None
     """Folder of the run, in which NAME.scene is written (default: outputs/NAME)."""
-    method: Literal["lang3dxl", "lang3dxl-paper"] = "lang3dxl"
+    method: Method = "lang3dxl"
     """lang3dxl: words are learned after training. lang3dxl-paper: codes are trained with the scene, as
     printed."""
     steps: int | None = None
     """Iterations (default: 30,000 on a GPU, 70,000 as printed, and 3,000 without one)."""
     looks: Literal["auto", "on", "off"] = "auto"
     """Colors that depend on each photo's lighting. auto: where the photos differ in it."""
-    photo_scale: float | None = None
-    """Size of the training photos relative to the files' (default: 1, as printed 0.5)."""
+    photo_scale: float = 1.0
+    """Size of the training photos relative to the files'."""
     restart: bool = False
     """Train anew, over the run in the folder."""
 
@@ -57,22 +67,37 @@ class Train(RunSettings, SceneSettings, PreparationConfig):
         if settings.targets.clip != "none":
             say(f"Ask it:          lang3dxl query {run} --text windows --out found")
 
+    @classmethod
+    def usual(cls, words: Sequence[str], **changes: Any) -> Train:
+        """Return the settings that a command line starts from, which are those of the method that it names.
+
+        Args:
+            words: words of the command line.
+            changes: settings that the caller has other usual values for.
+        """
+        parser = ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
+        parser.add_argument("--method")
+        usual = cls(data=tyro.MISSING)
+        given, _ = parser.parse_known_args([*words, ""])  # with a value for a last word --method, too
+        if given.method == "lang3dxl-paper":
+            plain_as_printed(usual, usual)
+            usual.looks, usual.photo_scale = PRINTED_LOOKS, PRINTED_PHOTO_SCALE
+        return replace(usual, **changes)
+
     def settings(self) -> Settings:
-        """Return the settings of the run: its method's usual ones, but for those that were given here."""
+        """Return the settings of the run. Raises UserError for one without effect."""
         from lang3dxl_ns.training.fit import Settings
 
         settings = Settings.of(self.method, self.steps)
-        parts = {SceneSettings: settings.scene, PreparationConfig: settings.targets, RunSettings: settings}
+        parts: dict[type, Any] = {
+            SceneSettings: settings.scene,
+            PreparationConfig: settings.targets,
+            CaptureSettings: settings.capture,
+            RunSettings: settings,
+        }
         for kind, owner in parts.items():
-            for name, value in _changed(self, kind).items():
-                setattr(owner, name, value)
-        settings.photo_scale = self.photo_scale or settings.photo_scale
-        if self.looks != "auto":
-            settings.scene.appearance.use = self.looks
+            for field in fields(kind):
+                setattr(owner, field.name, getattr(self, field.name))
+        settings.photo_scale, settings.scene.appearance.use = self.photo_scale, self.looks
+        settings.check_effect()
         return settings
-
-
-def _changed(settings: object, kind: type) -> dict[str, Any]:
-    """Return the plain settings of a kind that differ from its defaults."""
-    plain = [f for f in fields(kind) if f.default is not MISSING]
-    return {f.name: getattr(settings, f.name) for f in plain if getattr(settings, f.name) != f.default}

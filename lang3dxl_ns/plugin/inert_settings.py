@@ -9,7 +9,7 @@ from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.plugin.optimizers import parameter_groups
 from lang3dxl_ns.preparation.settings import PreparationConfig
 from lang3dxl_ns.training.learning_rates import learning_rates
-from lang3dxl_ns.training.settings import TrainingSettings
+from lang3dxl_ns.training.settings import TrainingSettings, without_effect
 
 OF_SPLATFACTO = (
     *("enable_collider", "collider_params", "loss_coefficients", "eval_num_rays_per_chunk", "prompt"),
@@ -32,11 +32,6 @@ OF_COLMAP = (
     *("load_3D_points", "train_split_fraction"),
 )
 """Settings of nerfstudio's COLMAP reader; this package's reads points always, and depths never."""
-_OF_RENDERINGS = (
-    *("clip_weight", "dense_weight", "region_weight", "decode_size", "warm_up", "semantic_ramp"),
-    *("codes_from", "feature_gradient_to_geometry", "downsampler"),
-)
-"""Settings that matter only for semantics that are trained with the scene."""
 _GROUPS_OF_RENDERINGS = ("codes", "field_encoding", "field_decoder", "downsampler")
 """Optimizer groups of such semantics."""
 
@@ -48,23 +43,15 @@ def check_inert(
     settings of the model and of the data manager. optimizers: those of the parameter groups."""
     if model.decoder.learns_from_renderings:
         return
-    changed = _changed(model, _OF_RENDERINGS, "--pipeline.model.")
-    changed += _changed(model.semantic_field, ("code_std",), "--pipeline.model.semantic-field.")
+    of_scene, of_targets = without_effect(model, data)
+    changed = [f"pipeline.model.{name}" for name in of_scene]
     default = parameter_groups(learning_rates())
     given = default if optimizers is None else optimizers
-    groups = [name for name in _GROUPS_OF_RENDERINGS if given[name] != default[name]]
-    changed += [f"--optimizers.{name.replace('_', '-')}" for name in groups]
-    if data.regions not in ("auto", "none"):
-        changed.append("--pipeline.datamanager.regions")
+    changed += [f"optimizers.{name}" for name in _GROUPS_OF_RENDERINGS if given[name] != default[name]]
+    changed += [f"pipeline.datamanager.{name}" for name in of_targets]
     if changed:
         raise UserError(
-            f"{changed[0]} has no effect where semantics are learned after training, as with "
-            f"--pipeline.model.decoder.name {model.decoder.name}: leave it off, or train with "
+            f"--{changed[0].replace('_', '-')} has no effect where semantics are learned after training, as "
+            f"with --pipeline.model.decoder.name {model.decoder.name}: leave it off, or train with "
             "ns-train lang3dxl-paper"
         )
-
-
-def _changed(settings: Any, names: tuple[str, ...], prefix: str) -> list[str]:
-    default = type(settings)()
-    changed = [name for name in names if getattr(settings, name) != getattr(default, name)]
-    return [prefix + name.replace("_", "-") for name in changed]

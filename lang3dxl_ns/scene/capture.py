@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -21,9 +21,10 @@ from lang3dxl_ns.common.console import say, some
 from lang3dxl_ns.common.errors import UserError, printable, readable
 from lang3dxl_ns.common.files import expanded, read_names
 from lang3dxl_ns.scene.camera import camera_to_world
+from lang3dxl_ns.scene.capture_settings import CaptureSettings
 from lang3dxl_ns.scene.colmap import Reconstruction, TrackedPhoto, photos_in_model, read_reconstruction
 from lang3dxl_ns.scene.companions import inside, is_inside
-from lang3dxl_ns.scene.frame import COLMAP_UP, Center, Frame, Orientation, find_frame, lost_cameras
+from lang3dxl_ns.scene.frame import COLMAP_UP, Frame, find_frame, lost_cameras
 from lang3dxl_ns.scene.layout import (
     MODEL_FOLDERS,
     find_model,
@@ -52,37 +53,6 @@ class Split(NamedTuple):
 
     train: tuple[str, ...]
     held_out: tuple[str, ...]
-
-
-@dataclass
-class CaptureSettings:
-    """Where a capture's parts are, and how it is split and normalized."""
-
-    colmap_path: Path | None = None
-    """COLMAP model, relative to the data folder (default: sparse/0, sparse, colmap/sparse/0 or
-    dense/sparse)."""
-    images_path: Path = Path("images")
-    """Folder of the photos, relative to the data folder; dense/images is tried too."""
-    masks_path: Path | None = Path("masks")
-    """Folder of foreground masks, relative to the data folder, named like the photos (.png or .jpg); white
-    marks what to keep. A photo without a mask is used whole. --pipeline.datamanager.foreground has other
-    sources."""
-    held_out: Path | None = None
-    """Text file with names of the photos to hold out of training, one per line, with or without suffix, in
-    place of every eighth photo. `lang3dxl evaluate split` makes one from ground truth."""
-    follow_links: bool = False
-    """Whether photos and masks may be symbolic links that leave their folder."""
-    eval_mode: Literal["interval", "all"] = "interval"
-    """Rule for the held-out photos: every `eval_interval`-th one in the order of names, or none."""
-    eval_interval: int = 8
-    orientation_method: Orientation = "up"
-    """Direction that becomes z in training: see `find_frame`."""
-    center_method: Center = "poses"
-    """Origin in training: see `find_frame`."""
-    auto_scale_poses: bool = True
-    """Whether the farthest coordinate of a camera becomes 1 in training."""
-    scale_factor: float = 1.0
-    """Scale of the training frame in addition."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Float64
 from numpy import ndarray as Array
 from scipy.spatial.transform import Rotation
 
-Orientation = Literal["up", "vertical", "none"]
-Center = Literal["poses", "none"]
+from lang3dxl_ns.scene.capture_settings import Center, Orientation
 
 COLMAP_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 """Rotation from COLMAP's usual y down to z up."""

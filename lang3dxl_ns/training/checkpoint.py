@@ -71,10 +71,12 @@ def read_checkpoint(path: Path, about: Mapping[str, Any]) -> dict[str, Any] | No
         return None
     with as_damage(path):
         content = load_checked(path, "tensors")
-        changed = [name for name in about if about[name] != content["about"].get(name)]
+        then = content["about"]  # of earlier versions, with fewer names
+        changed = [name for name in about if name in then and about[name] != then[name]]
     if changed:
+        told = [name if name == "photos" else f"{name.replace('_', '-')} {then[name]}" for name in changed]
         raise UserError(
-            f"{path.parent} holds a run with another {' and '.join(changed)}: give its options to go on, "
-            "another --out, or --restart to train anew"
+            f"{path.parent} holds another run ({', '.join(told)}): give its options to go on, another --out, "
+            "or --restart to train anew"
         )
     return content

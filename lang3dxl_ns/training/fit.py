@@ -5,16 +5,19 @@ from __future__ import annotations
 import functools
 import threading
 import warnings
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, is_dataclass
+from difflib import get_close_matches
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, get_type_hints
 
 import torch
 from torch.optim.lr_scheduler import LambdaLR
+from typeguard import TypeCheckError, check_type
 
+from lang3dxl_ns.common.checks import check_numbers
 from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.device import best_device
-from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.errors import UserError, in_a_line
 from lang3dxl_ns.common.files import expanded
 from lang3dxl_ns.common.memory import ran_out_of_memory
 from lang3dxl_ns.common.stages import Stages
@@ -25,6 +28,7 @@ from lang3dxl_ns.preparation.needs import needs_table
 from lang3dxl_ns.preparation.settings import PreparationConfig
 from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.scene.capture import Capture, open_capture, say_left_out
+from lang3dxl_ns.scene.capture_settings import CaptureSettings
 from lang3dxl_ns.scene.companions import cache_folder
 from lang3dxl_ns.scene.photo_folder import check_data
 from lang3dxl_ns.training.batches import TrainingData, settle
@@ -33,18 +37,26 @@ from lang3dxl_ns.training.estimate import check_device, estimate
 from lang3dxl_ns.training.learn_codes import begin_codes, forget_words, learn_words
 from lang3dxl_ns.training.learning_rates import Rates, learning_rates, printed_learning_rates
 from lang3dxl_ns.training.memory import out_of_memory, plan
-from lang3dxl_ns.training.scene_settings import RunSettings
-from lang3dxl_ns.training.settings import PRINTED_PHOTO_SCALE, TrainingSettings, as_printed
+from lang3dxl_ns.training.scene_settings import PRINTED_PHOTO_SCALE, Method, RunSettings
+from lang3dxl_ns.training.settings import TrainingSettings, as_printed, without_effect
 from lang3dxl_ns.training.snapshot import snapshot
 from lang3dxl_ns.training.state import Training
 from lang3dxl_ns.training.step import finish, losses, render
 from lang3dxl_ns.training.step_guard import StepGuard
 
-Method = Literal["lang3dxl", "lang3dxl-paper"]
 USUAL_STEPS = {"lang3dxl": 30_000, "lang3dxl-paper": 70_000}
 """Iterations on a GPU, by method."""
 STEPS_ON_A_CPU = 3_000
 """A step on a CPU takes 0.1 s or more, so the default is a run that ends within minutes."""
+
+
+_BOUNDS = {"steps": (1, 1e9), "save_every": (1, 1e9), "photo_scale": (0.001, 8), "seed": (0, 2**32 - 1)}
+_OF_THE_MACHINE = {
+    *("cache_dir", "workers", "engine", "address", "crop_batch", "rasterizer", "max_gaussians"),
+    *("mixed_precision", "save_every", "max_skipped_steps", "total_steps", "skip_damaged_masks"),
+    *("colmap_path", "images_path", "masks_path", "follow_links"),
+}
+"""Settings that may change when a run goes on: where it runs, what is where, and how often it is saved."""
 
 
 @dataclass
@@ -57,6 +69,7 @@ class Settings(RunSettings):
     scene: TrainingSettings = field(default_factory=TrainingSettings)
     targets: PreparationConfig = field(default_factory=PreparationConfig)
     rates: Rates = field(default_factory=learning_rates)
+    capture: CaptureSettings = field(default_factory=CaptureSettings)
     photo_scale: float = 1.0
     """Size of the training photos relative to the files'."""
     max_skipped_steps: int = 20
@@ -66,6 +79,8 @@ class Settings(RunSettings):
     def of(method: Method, steps: int | None = None) -> Settings:
         """Return the usual settings of a method, for its usual number of iterations on this machine unless
         another is given."""
+        if method not in USUAL_STEPS:
+            raise UserError(f"there is no method {method!r}: choose one of {', '.join(USUAL_STEPS)}")
         usual = USUAL_STEPS[method] if best_device() == "cuda" else STEPS_ON_A_CPU
         settings = Settings(method, usual if steps is None else steps)
         if method == "lang3dxl-paper":
@@ -73,9 +88,41 @@ class Settings(RunSettings):
             settings.rates, settings.photo_scale = printed_learning_rates(), PRINTED_PHOTO_SCALE
         return settings
 
+    def set(self, name: str, value: Any) -> None:
+        """Set a setting of the run, or of its scene, targets or capture, by name (`looks` too). Raises
+        UserError for a name that there is not, and for a value of another kind."""
+        owners: tuple[Any, ...] = self.scene, self.targets, self.capture, self
+        owner = next((part for part in owners if name in get_type_hints(type(part))), None)
+        attribute = name
+        if name == "looks":
+            owner, attribute = self.scene.appearance, "use"
+        if owner is None:
+            known = [setting.name for part in owners for setting in fields(part)]
+            near = "".join(f"did you mean {n}? " for n in get_close_matches(name, known, n=1))
+            raise UserError(f"there is no setting {name}: {near}lang3dxl train --help-all lists them")
+        kind = get_type_hints(type(owner))[attribute]
+        if isinstance(value, str) and kind in (Path, Path | None):
+            value = Path(value)
+        try:
+            check_type(value, kind)
+        except TypeCheckError as error:
+            raise UserError(f"{name} can't be {value!r}: it {in_a_line(error)}") from error
+        setattr(owner, attribute, value)
+
+    def check_effect(self) -> None:
+        """Raise UserError for a setting that has no effect with this method. Call this before `resolve`,
+        which changes settings."""
+        of_scene, of_targets = without_effect(self.scene, self.targets)
+        if changed := [*of_scene, *of_targets]:
+            raise UserError(
+                f"--{changed[0].replace('_', '-')} has no effect where words are learned after "
+                "training: leave it off, or train with --method lang3dxl-paper"
+            )
+
     def resolve(self) -> None:
         """Check all settings, and resolve what depends on the length of the run, in place. Raises UserError
         for a setting that is out of its range."""
+        check_numbers(self, _BOUNDS)
         self.scene.check()
         self.targets.check()
         self.scene.fit_to_run(self.steps)
@@ -92,6 +139,7 @@ class Run:
 
     def __init__(self, capture: Capture, settings: Settings, folder: Path, cache_dir: Path, device: str):
         self.settings, self.folder, self.device = settings, folder, device
+        self.about = _about(settings, capture)
         learned, scale = settings.scene.decoder.learns_from_renderings, settings.photo_scale
         self.data = TrainingData(capture, settings.targets, cache_dir, device, learned, scale)
         self.path = folder / f"{capture.folder.name or 'scene'}{SUFFIX}"
@@ -114,13 +162,6 @@ class Run:
         self.guard = StepGuard(settings.max_skipped_steps, say)
         say(plan(self.state, self.data.cameras))
         torch.manual_seed(settings.seed)
-
-    @property
-    def about(self) -> dict[str, Any]:
-        """What a checkpoint must agree in to be resumed."""
-        s, frame = self.settings, self.data.capture.recorded_frame
-        photos = [round(v, 3) for v in (*frame.transform.flatten().tolist(), frame.scale)]
-        return {"method": s.method, "clip": s.targets.clip, "steps": s.steps, "photos": photos}
 
     def iterate(self, step: int) -> None:
         """Train one iteration."""
@@ -241,6 +282,21 @@ class Run:
         self.words_are_learned = True
 
 
+def _about(settings: Settings, capture: Capture) -> dict[str, Any]:
+    """Describe what a checkpoint must agree in to be resumed: the photos, and the plain settings."""
+    frame = capture.recorded_frame
+    photos = [round(v, 3) for v in (*frame.transform.flatten().tolist(), frame.scale)]
+    parts = settings.capture, settings.targets, settings.scene, settings
+    plain = {f.name: getattr(part, f.name) for part in parts for f in fields(part)}
+    plain["looks"] = settings.scene.appearance.use
+    told = {
+        name: str(value) if isinstance(value, Path) else value
+        for name, value in plain.items()
+        if name not in {*_OF_THE_MACHINE, "rates"} and not is_dataclass(value)
+    }
+    return told | {"photos": photos}
+
+
 def begin(capture: Capture, settings: Settings, out: Path, cache_dir: Path, device: str | None = None) -> Run:
     """Prepare a run, or the continuation of the folder's; see `fit`."""
     # A group without gradients so far has a schedule all the same.
@@ -285,7 +341,7 @@ def run_folder(
     check_data(expanded(data))
     settings.resolve()
     check_encoders(settings.targets.clip, settings.targets.dense)
-    capture = open_capture(data, cache_dir=settings.targets.cache_dir)
+    capture = open_capture(data, settings.capture, settings.targets.cache_dir)
     say_left_out(capture)
     folder = Path("outputs") / (capture.folder.name or "scene") if out is None else expanded(out)
     if restart:
@@ -300,6 +356,7 @@ def train(
     *,
     steps: int | None = None,
     method: Method = "lang3dxl",
+    restart: bool = False,
     **settings: Any,
 ) -> Scene:
     """Train a scene from photos, or go on with a run that was stopped, and return it.
@@ -309,19 +366,18 @@ def train(
         out: folder of the run, in which NAME.scene is written; by default outputs/NAME.
         steps: iterations; by default 30,000 (70,000 as printed) on a GPU and 3,000 without one.
         method: `lang3dxl`, or `lang3dxl-paper` as printed.
-        **settings: settings of `TrainingSettings`, `PreparationConfig` and `Settings` by name, such as
-            clip="builtin".
+        restart: train anew, over the run in the folder.
+        **settings: settings of `TrainingSettings`, `PreparationConfig`, `CaptureSettings` and `Settings` by
+            name, such as clip="builtin".
 
     Raises:
         UserError: the photos or settings cannot be used, or training was interrupted.
     """
     chosen = Settings.of(method, steps)
     for name, value in settings.items():
-        owner = next((o for o in (chosen.scene, chosen.targets, chosen) if hasattr(o, name)), None)
-        if owner is None:
-            raise UserError(f"there is no setting {name}: see lang3dxl train --help-all")
-        setattr(owner, name, value)
+        chosen.set(name, value)
+    chosen.check_effect()
     try:
-        return run_folder(data, out, chosen)[1]
+        return run_folder(data, out, chosen, restart)[1]
     except KeyboardInterrupt as error:
         raise UserError("training was stopped; to resume: the same call") from error

@@ -17,9 +17,8 @@ from torch import Tensor
 from torch.optim import Adam, Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 
-EXTENT = 1.1
-"""The published extent, 1.1 times the largest distance of a camera from the cameras' center, which is scaled
-to about 1."""
+from lang3dxl_ns.training.scene_settings import EXTENT
+
 SHORT_RUN = 1_000
 """Iterations up to which runs use the short-run rates."""
 LONG_RUN = 30_000

@@ -15,11 +15,9 @@ from lang3dxl_ns.components.downsampler import DownsamplerConfig
 from lang3dxl_ns.components.feature_decoder import LearningDecoder
 from lang3dxl_ns.components.semantic_field import Preset, SemanticFieldConfig
 from lang3dxl_ns.preparation.settings import PreparationConfig
-from lang3dxl_ns.training.learning_rates import EXTENT, log_linear, run_length_weight
-from lang3dxl_ns.training.scene_settings import SceneSettings
+from lang3dxl_ns.training.learning_rates import log_linear, run_length_weight
+from lang3dxl_ns.training.scene_settings import PRINTED_LOOKS, SceneSettings, plain_as_printed
 
-PRINTED_PHOTO_SCALE = 0.5
-"""Size of the paper's training photos, relative to the photos."""
 SHORT_FIELD_RUN = 5_000
 """Iterations below which a run that trains the field with the scene uses its `short` preset, since the
 published grid has learned no words after 300. `auto` of `codes_from` and of the looks' grid use this too."""
@@ -124,16 +122,25 @@ class TrainingSettings(SceneSettings):
 
 
 def as_printed(settings: TrainingSettings, targets: PreparationConfig) -> None:
-    """Set what the paper prints or, where it is silent, what its authors released, in place;
-    docs/deviations.md lists where. Its schedule of 70,000 iterations is scaled to the length of the run."""
-    x = 1 / 70_000
-    settings.decoder.name, settings.codes_from = "paper", "auto"
-    settings.dense_weight = 0.5
-    settings.feature_gradient_to_geometry, settings.semantic_ramp = True, 15_000 * x
-    settings.densify_from, settings.densify_until, settings.densify_every = 2_000 * x, 15_000 * x, 2_000 * x
-    settings.densify_size_thresh = 0.2 * EXTENT
-    settings.view_dependence, settings.camera_optimization = "on", "off"
+    """Set all to what the paper prints, in place; see `plain_as_printed`."""
+    plain_as_printed(settings, targets)
+    settings.decoder.name = "paper"
     looks = settings.appearance
-    looks.use, looks.preset, looks.opacity_shift = "on", "auto", True
-    targets.scale_mode, targets.pixel_distance = "physical", "mean-inner"
-    targets.regions, targets.sam = "sam", "facebook/sam-vit-huge"
+    looks.use, looks.preset, looks.opacity_shift = PRINTED_LOOKS, "auto", True
+
+
+_OF_RENDERINGS = (
+    *("clip_weight", "dense_weight", "region_weight", "decode_size", "warm_up", "semantic_ramp"),
+    *("codes_from", "feature_gradient_to_geometry", "downsampler", "semantic_field.code_std"),
+)
+"""Settings that matter only for semantics that are trained with the scene."""
+
+
+def without_effect(scene: TrainingSettings, targets: PreparationConfig) -> tuple[list[str], list[str]]:
+    """List the settings, of the scene and of the targets, that differ from their defaults although they have
+    no effect in this run. Call this before `fit_to_run`, which changes them."""
+    if scene.decoder.learns_from_renderings:
+        return [], []
+    usual, regions = TrainingSettings(), targets.regions not in ("auto", "none")
+    changed = [name for name in _OF_RENDERINGS if attrgetter(name)(scene) != attrgetter(name)(usual)]
+    return changed, ["regions"] if regions else []

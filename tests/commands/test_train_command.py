@@ -1,5 +1,7 @@
 """`lang3dxl train`: settings by short names, and what it leaves and says."""
 
+from pathlib import Path
+
 import pytest
 import torch
 from scenes import write_scene
@@ -8,6 +10,7 @@ import lang3dxl_ns
 from lang3dxl_ns import cli
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.training import fit as fitting
+from lang3dxl_ns.training.fit import Settings
 
 
 def test_short_names_reach_the_settings_and_the_folder_opens(tmp_path, capsys):
@@ -34,12 +37,84 @@ def test_the_papers_method_keeps_its_settings_where_none_are_given(monkeypatch, 
     assert settings.photo_scale == 0.5 and settings.targets.regions == "sam"
 
 
-def test_a_wrong_setting_is_named_as_it_is_spelled_here(tmp_path):
+def parsed(*words) -> Settings:
+    return cli._parsed(["train", "photos", *words]).settings()
+
+
+@pytest.mark.parametrize("method", ["lang3dxl", "lang3dxl-paper"])
+def test_the_command_alone_has_a_methods_usual_settings(method):
+    found, usual = parsed("--method", method), Settings.of(method)
+    for part in ("scene", "targets", "capture", "photo_scale", "seed", "steps", "save_every"):
+        assert getattr(found, part) == getattr(usual, part)
+
+
+def test_what_is_given_counts_even_where_it_is_usual_for_another_method():
+    words = ["--codes-from", "noise", "--regions", "auto", "--view-dependence", "auto", "--looks", "auto"]
+    words += ["--densify-until", "0.5", "--photo-scale", "1", "--scale-mode", "auto"]
+    for method in (["--method", "lang3dxl-paper"], ["--method=lang3dxl-paper"]):
+        found = parsed(*words, *method)
+        assert found.scene.decoder.name == "paper"
+        assert (found.scene.codes_from, found.targets.regions, found.targets.scale_mode) == (
+            *("noise", "auto", "auto"),
+        )
+        assert (found.scene.view_dependence, found.scene.appearance.use) == ("auto", "auto")
+        assert (found.scene.densify_until, found.photo_scale) == (0.5, 1.0)
+
+
+def test_photos_are_found_and_held_out_as_the_options_say(tmp_path):
+    data = write_scene(tmp_path / "scene", photos=6, points=60)
+    (data / "images").rename(data / "pictures")
+    (tmp_path / "list.txt").write_text("photo_001.jpg")
+    words = ["--images-path", "pictures", "--held-out", str(tmp_path / "list.txt"), "--clip", "none"]
+    cli.main(["train", str(data), "--out", str(tmp_path / "run"), "--steps", "2", *words])
+    scene = lang3dxl_ns.load_scene(tmp_path / "run")
+    assert [photo.name for photo in scene.photos if photo.split == "eval"] == ["photo_001.jpg"]
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--ssim-lambda", "2"], "--ssim-lambda is 2"),
+        (["--steps", "0"], "--steps is 0: give a number from 1"),
+        (["--photo-scale", "0"], "--photo-scale is 0"),
+        (["--save-every", "0"], "--save-every is 0"),
+        (["--clip-weight", "7"], "--clip-weight has no effect .* --method lang3dxl-paper"),
+        (["--regions", "felzenszwalb"], "--regions has no effect"),
+    ],
+)
+def test_a_wrong_setting_is_named_as_it_is_spelled_here(tmp_path, words, message):
     data = write_scene(tmp_path / "scene", photos=4, points=60)
-    with pytest.raises(SystemExit, match=r"Error: --ssim-lambda is 2"):
-        cli.main(["train", str(data), "--ssim-lambda", "2", "--clip", "none"])
-    with pytest.raises(UserError, match="there is no setting clipp"):
-        lang3dxl_ns.train(data, tmp_path / "run", clipp="none")
+    with pytest.raises(SystemExit, match=f"Error: {message}"):
+        cli.main(["train", str(data), "--out", str(tmp_path / "run"), "--clip", "none", *words])
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        ({"clipp": "none"}, "there is no setting clipp: did you mean clip?"),
+        ({"check": 1}, "there is no setting check"),
+        ({"scene": 5}, "scene can't be 5"),
+        ({"photo_scale": "half"}, "photo_scale can't be 'half'"),
+        ({"looks": "perhaps"}, "looks can't be 'perhaps'"),
+        ({"method": "paper"}, "there is no method 'paper': choose one of lang3dxl, lang3dxl-paper"),
+        ({"warm_up": 0.3}, "--warm-up has no effect"),
+    ],
+)
+def test_a_wrong_setting_from_python_is_named(tmp_path, setting, message):
+    with pytest.raises(UserError, match=message.replace("?", r"\?")):
+        lang3dxl_ns.train(tmp_path, tmp_path / "run", **setting)
+
+
+def test_settings_from_python_reach_the_run(monkeypatch, tmp_path):
+    made = []
+    monkeypatch.setattr(
+        fitting, "run_folder", lambda data, out, settings, restart: (made.append(settings), 1)
+    )
+    lang3dxl_ns.train("photos", clip="builtin", looks="off", held_out="list.txt", photo_scale=1, seed=7)
+    (found,) = made
+    assert (found.targets.clip, found.scene.appearance.use) == ("builtin", "off")
+    assert (found.capture.held_out, found.photo_scale, found.seed) == (Path("list.txt"), 1, 7)
 
 
 def test_ctrl_c_from_python_is_the_error_that_it_promises(tmp_path, monkeypatch):

@@ -159,8 +159,20 @@ def test_a_finished_run_is_not_trained_again_and_another_one_is_refused(data, se
     monkeypatch.setattr(fitting, "render", lambda *_: pytest.fail("trained again"))
     monkeypatch.setattr(fitting, "learn_words", lambda *_: pytest.fail("learned again"))
     trained(data, short.out, settings(4))
-    with pytest.raises(UserError, match="holds a run with another steps"):
+    with pytest.raises(UserError, match=r"holds another run \(steps 4\)"):
         trained(data, short.out, settings(5))
+    other = settings(4, sky_gaussians=300)
+    other.seed, other.photo_scale = 7, 0.5
+    with pytest.raises(
+        UserError, match=r"another run \(sky-gaussians 400, seed 42, photo-scale 1\.0\): give its options"
+    ):
+        trained(data, short.out, other)
+
+
+def test_a_run_goes_on_where_other_settings_make_no_other_scene(data, settings, short):
+    other = settings(4)
+    other.save_every, other.targets.workers = 3, 2
+    assert differing(short.tensors, trained(data, short.out, other)) == []
 
 
 def test_mixed_precision_without_such_a_gpu_is_refused_before_anything_is_prepared(data, settings, tmp_path):
