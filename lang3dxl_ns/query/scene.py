@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any, TypeVar, overload
+from typing import TYPE_CHECKING, Any, TypeVar, overload
 
 import numpy as np
 import torch
@@ -39,9 +39,11 @@ from lang3dxl_ns.query.vocabulary import searched, shipped_vocabulary
 from lang3dxl_ns.rendering import Rendering, Splats
 from lang3dxl_ns.scene.camera import Camera, posed, resized, with_field_of_view, with_longer_side
 from lang3dxl_ns.scene.record import ScenePhoto, SceneRecord, overview
-from lang3dxl_ns.things.find import Things, things_of
 from lang3dxl_ns.words.taught_words import Example, TaughtWord, known_word
 from lang3dxl_ns.words.teach import carried_word, learned_word, least_certain_photo
+
+if TYPE_CHECKING:
+    from lang3dxl_ns.things.find import Things
 
 _ROWS = 65_536
 """Number of Gaussians decoded at a time."""
@@ -385,6 +387,8 @@ class Scene:
 
     def things(self, texts: Text | Sequence[Text]) -> list[Things]:
         """Find the single things that each prompt of `texts` (see `ask`) names: windows, portals, towers."""
+        from lang3dxl_ns.things.find import things_of  # scipy's parts take a tenth of the time to open a file
+
         return things_of(self, self.ask(texts))
 
     # ── words taught by example ─────────────────────────────────────────────────────────────────────

@@ -12,7 +12,6 @@ from types import ModuleType
 import numpy as np  # before pycolmap: in the other order, Pillow's PNG writer aborts the process
 from jaxtyping import Float, UInt8
 from numpy import ndarray as Array
-from scipy.spatial.transform import Rotation
 
 from lang3dxl_ns.common.checks import FARTHEST, expect
 from lang3dxl_ns.common.console import say, some
@@ -122,6 +121,8 @@ def photos_in_model(model_dir: Path) -> int:
 def _tracked_photo(
     photo: ModelPhoto, files: ModelFiles, rows: dict[int, int], positions: Float[Array, "m 3"]
 ) -> TrackedPhoto:
+    from scipy.spatial.transform import Rotation  # a tenth of the time in which a scene file opens
+
     camera = files.cameras.get(photo.camera)
     if camera is None:
         raise UserError(f"photo {photo.name} has the camera {photo.camera}, which the COLMAP model lacks")

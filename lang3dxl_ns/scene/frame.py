@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Float64
 from numpy import ndarray as Array
-from scipy.spatial.transform import Rotation
 
 from lang3dxl_ns.scene.capture_settings import Center, Orientation
 
@@ -102,6 +101,8 @@ def _apart(centers: Float[Array, "n 3"], points: Float[Array, "m 3"]) -> bool:
 
 def turned_to(direction: Float[Array, "3"], target: tuple[int, int, int]) -> Float64[Array, "3 3"]:
     """Compute the smallest rotation that takes a direction to another; the identity for a zero vector."""
+    from scipy.spatial.transform import Rotation  # a tenth of the time in which a scene file opens
+
     length = float(np.linalg.norm(direction))
     if length < 1e-12:
         return np.eye(3)

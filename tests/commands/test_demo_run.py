@@ -71,7 +71,7 @@ def test_the_same_command_does_nothing_twice_and_another_length_is_another_run(d
     written = [path.stat().st_mtime_ns for path in files]
     demo.main()
     assert [path.stat().st_mtime_ns for path in files] == written
-    with pytest.raises(UserError, match="another run .steps 6.: give its options"):
+    with pytest.raises(UserError, match=r"another run \(steps 6\): give its options"):
         replace(demo, steps=8).main()
 
 
