@@ -115,7 +115,7 @@ _MORE = "Settings that few need are listed too with --help-all."
 def _parsed(words: Sequence[str]) -> Any:
     """Parse the words into the called command with its settings. Exits with a hint if they are not valid."""
     _check_name(COMMANDS, words)
-    words = with_all_texts(words)
+    words = with_data_as_taken(with_all_texts(words))
     try:
         config = (tyro.conf.OmitArgPrefixes,)
         parsed = tyro.cli(
@@ -145,6 +145,17 @@ def with_all_texts(words: Sequence[str]) -> list[str]:
             given.append("--text")
         given.append(word)
     return given
+
+
+def with_data_as_taken(words: Sequence[str]) -> list[str]:
+    """Spell the folder of photos as its command takes it: `train FOLDER`, but `reconstruct --data FOLDER`.
+    People write either for both."""
+    if words[:1] == ["train"]:
+        return [word.removeprefix("--data=") for word in words if word != "--data"]
+    named = words[:1] and words[0] in ("reconstruct", "prepare", "needs")
+    if named and words[1:] and not words[1].startswith("-"):
+        return [words[0], "--data", *words[1:]]
+    return list(words)
 
 
 def _check_name(commands: Mapping[str, Any], words: Sequence[str], above: str = "lang3dxl") -> None:

@@ -6,6 +6,7 @@ import os
 import socket
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -88,6 +89,12 @@ def test_several_texts_may_follow_their_flag_and_the_scene_too(tmp_path):
     )
     assert cli.with_all_texts(["query", scene, "--text", scene]) == ["query", scene, "--text", scene]
     assert cli.with_all_texts(["teach", scene, "--text=a", "b"]) == ["teach", scene, "--text=a", "b"]
+
+
+@pytest.mark.parametrize("command", ["train", "reconstruct", "prepare", "needs"])
+@pytest.mark.parametrize("spelled", [["photos"], ["--data", "photos"], ["--data=photos"]])
+def test_a_folder_of_photos_is_taken_with_and_without_its_options_name(command, spelled):
+    assert cli._parsed([command, *spelled]).data == Path("photos")
 
 
 def test_a_port_that_is_taken_is_not_replaced_silently():
