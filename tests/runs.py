@@ -5,7 +5,7 @@ from pathlib import Path
 
 import torch
 
-from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
+from lang3dxl_ns.components.field_settings import SemanticFieldConfig
 
 
 def fitted(data: Path, clip: Path, dense: Path, out: Path, steps: int = 2):

@@ -10,8 +10,9 @@ from processes import Process
 def on_eight_threads() -> None:
     """All kernels of a step and of gathering, with one thread and with eight."""
     from lang3dxl_ns.common import jit
+    from lang3dxl_ns.components.field_settings import SemanticFieldConfig
     from lang3dxl_ns.components.losses import rgb_loss
-    from lang3dxl_ns.components.semantic_field import SemanticField, SemanticFieldConfig
+    from lang3dxl_ns.components.semantic_field import SemanticField
     from lang3dxl_ns.rendering import Gaussians, rasterize
     from lang3dxl_ns.scene.camera import Camera
 
@@ -45,9 +46,9 @@ def of_large_photos(folder, clip, dense) -> None:
 
 
 def of_a_million_gaussians() -> None:
-    from lang3dxl_ns.components.compression import CompressedField, CompressionConfig, centered_cosine
+    from lang3dxl_ns.components.compression import CompressedField, centered_cosine
     from lang3dxl_ns.components.feature_decoder import Gathered
-    from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
+    from lang3dxl_ns.components.field_settings import CompressionConfig, SemanticFieldConfig
     from lang3dxl_ns.query.doubt import UNRELATED, Doubts
     from lang3dxl_ns.query.engine import make_engine
     from lang3dxl_ns.query.relevancy import Queries

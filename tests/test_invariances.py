@@ -9,7 +9,8 @@ from numerics.physical_scale import in_world
 from scenes import write_scene
 
 from lab.numerics.rasterizer import Scene
-from lang3dxl_ns.components.semantic_field import SemanticField, SemanticFieldConfig
+from lang3dxl_ns.components.field_settings import SemanticFieldConfig
+from lang3dxl_ns.components.semantic_field import SemanticField
 from lang3dxl_ns.plugin.dataparser import PhotoCollectionDataParserConfig
 from lang3dxl_ns.preparation.physical_scale import (
     crop_sides,

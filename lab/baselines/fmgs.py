@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -13,7 +12,8 @@ from torch import Tensor, nn
 
 from lab.baselines.lifting import split
 from lang3dxl_ns.components.feature_decoder import Decoder, Features
-from lang3dxl_ns.components.semantic_field import SemanticField, SemanticFieldConfig
+from lang3dxl_ns.components.field_settings import CompressionConfig, SemanticFieldConfig
+from lang3dxl_ns.components.semantic_field import SemanticField
 
 _ALIGNMENT = 0.01
 """Weight of the loss that aligns CLIP with dense features (published: 0.01 to 0.03)."""
@@ -31,6 +31,7 @@ class PlaceField(Decoder):
         super().__init__(clip_dim, dense_dim)
         # A position has three coordinates, whatever the field's code size.
         self.field = SemanticField(replace(config, code_dim=3, bounding="sigmoid"), clip_dim, dense_dim)
+        self.settings = self.field.settings
         self.center: Tensor
         self.radius: Tensor
         self.register_buffer("center", torch.zeros(3))
@@ -38,7 +39,7 @@ class PlaceField(Decoder):
 
     @classmethod
     def build(
-        cls, settings: SemanticFieldConfig, clip_dim: int, compression: Any, dense_dim: int
+        cls, settings: SemanticFieldConfig, clip_dim: int, compression: CompressionConfig, dense_dim: int
     ) -> PlaceField:
         return cls(settings, clip_dim, dense_dim)
 

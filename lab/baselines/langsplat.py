@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable
 from itertools import pairwise
-from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -13,6 +12,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from lang3dxl_ns.components.feature_decoder import Decoder
+from lang3dxl_ns.components.field_settings import CompressionConfig, SemanticFieldConfig
 
 _ENCODER = (256, 128, 64, 32, 3)
 _DECODER = (16, 32, 64, 128, 256, 256)
@@ -43,7 +43,9 @@ class LangSplat(Decoder):
         self.register_buffer("norm", torch.ones(()))
 
     @classmethod
-    def build(cls, settings: Any, clip_dim: int, compression: Any, dense_dim: int) -> LangSplat:
+    def build(
+        cls, settings: SemanticFieldConfig, clip_dim: int, compression: CompressionConfig, dense_dim: int
+    ) -> LangSplat:
         return cls(clip_dim)
 
     def initial_codes(self, count: int) -> Float[Tensor, "count 3"]:

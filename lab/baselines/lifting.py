@@ -56,6 +56,8 @@ class Feature3DGS(Decoder):
     This 1×1 convolution outputs CLIP and dense features. They are whitened as in the semantic field, which
     can only help this baseline."""
 
+    code_dim: int
+
     def __init__(self, clip_dim: int, dense_dim: int) -> None:
         super().__init__(clip_dim, dense_dim)
         self.code_dim = max(clip_dim // 2, 1)

@@ -22,11 +22,12 @@ from lang3dxl_ns.common.files import write_atomically
 from lang3dxl_ns.common.image import fitted_size
 from lang3dxl_ns.common.reports import describe_machine, markdown_table, write_report
 from lang3dxl_ns.components.appearance import AppearanceConfig, AppearanceField
-from lang3dxl_ns.components.compression import CompressedField, CompressionConfig, centered_cosine
+from lang3dxl_ns.components.compression import CompressedField, centered_cosine
 from lang3dxl_ns.components.feature_decoder import Gathered
+from lang3dxl_ns.components.field_settings import CompressionConfig, SemanticFieldConfig
 from lang3dxl_ns.components.losses import rgb_loss
 from lang3dxl_ns.components.principal_basis import PrincipalBasis
-from lang3dxl_ns.components.semantic_field import SemanticField, SemanticFieldConfig
+from lang3dxl_ns.components.semantic_field import SemanticField
 from lang3dxl_ns.query.engine import PerGaussian
 from lang3dxl_ns.rendering import Gaussians, rasterize
 from lang3dxl_ns.rendering.gathering import Pixels, gather

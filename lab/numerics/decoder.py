@@ -13,8 +13,9 @@ from torch.nn.functional import linear
 
 from lab.numerics.hash_grid import interpolate_reference
 from lab.numerics.measure import EXACT, Bounds, Case, Maps, Problem
+from lang3dxl_ns.components.field_settings import SemanticFieldConfig
 from lang3dxl_ns.components.hash_grid import COORDINATE_LIMIT
-from lang3dxl_ns.components.semantic_field import SemanticField, SemanticFieldConfig
+from lang3dxl_ns.components.semantic_field import SemanticField
 
 CLIP, DENSE = 128, 32
 FINE = {"float32": Bounds(1e-3, 1e-4, 2e-2, 5e-3), "float64": EXACT}

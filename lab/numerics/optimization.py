@@ -9,8 +9,9 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
+from lang3dxl_ns.components.field_settings import SemanticFieldConfig
 from lang3dxl_ns.components.losses import clip_loss
-from lang3dxl_ns.components.semantic_field import SemanticField, SemanticFieldConfig
+from lang3dxl_ns.components.semantic_field import SemanticField
 
 PIXELS, BATCH, CHANNELS, KINDS = 1024, 64, 32, 12
 NOISE = 0.3

@@ -16,7 +16,7 @@ from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.image import resize_nearest
 from lang3dxl_ns.components.decoders import DecoderConfig, make_decoder
 from lang3dxl_ns.components.feature_decoder import Decoder, LearningDecoder
-from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
+from lang3dxl_ns.components.field_settings import SemanticFieldConfig
 from lang3dxl_ns.preparation.encoders import CLIP_OPTION, find_model, usual_dense
 from lang3dxl_ns.preparation.foreground import with_foreground
 from lang3dxl_ns.preparation.model_files import usual_clip

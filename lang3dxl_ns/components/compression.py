@@ -7,10 +7,8 @@ of neighbors never blend into a third one with another meaning.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
 
 import torch
 import torch.nn.functional as F
@@ -20,9 +18,10 @@ from torch import Tensor, nn
 from lang3dxl_ns.common.device import to_device
 from lang3dxl_ns.components.code_search import nearest, settle
 from lang3dxl_ns.components.feature_decoder import Gathered, LearningDecoder
+from lang3dxl_ns.components.field_settings import CompressionConfig, SemanticFieldConfig
 from lang3dxl_ns.components.hash_grid import MOST_DIMENSIONS
 from lang3dxl_ns.components.principal_basis import PrincipalBasis
-from lang3dxl_ns.components.semantic_field import SemanticField, SemanticFieldConfig
+from lang3dxl_ns.components.semantic_field import SemanticField
 
 GOOD = 0.95
 """Mean centered cosine below which codes get more numbers."""
@@ -36,35 +35,11 @@ _ROWS = 16_384
 """Number of Gaussians processed at a time, to bound memory."""
 _SECONDS_PER_DRAW, _SECONDS_PER_GAUSSIAN = 1e-5, 1e-4
 """Time on one core per Gaussian drawn in a step and per Gaussian searched, for the announced duration."""
-_MOST_GROWTH = 3
-"""Largest factor of steps and sample; more takes longer and hardly improves the features (docs/scale.md)."""
 _BLENDS = 0.9
 """Fraction of blends among the draws where codes are composited before they are decoded, as in the paper."""
 _SEARCHES = (0.4, 0.6, 0.8)
 """Fractions of the steps after which the sample's codes are searched anew, because descent alone leaves some
 of them in the wrong place."""
-
-
-@dataclass
-class CompressionConfig:
-    """Settings of the compression of features to codes."""
-
-    steps: int = 1_000
-    """Number of training steps. Scenes with many Gaussians take up to three times as many."""
-    batch: int = 3_072
-    """Number of Gaussians per step."""
-    sample: int = 16_384
-    """Number of Gaussians that the field is trained on. Scenes with many take up to three times as many."""
-    code_rate: float = 2e-2
-    """Adam's learning rate for the codes."""
-    field_rate: float = 1e-2
-    """Adam's learning rate for the field."""
-
-    def grown(self, count: int) -> CompressionConfig:
-        """Multiply steps and sample for `count` Gaussians by √(count / sample), rounded, in 1…3. A field that
-        has seen few of many Gaussians matches those few, and the others less."""
-        factor = min(max(round(math.sqrt(count / self.sample)), 1), _MOST_GROWTH)
-        return replace(self, steps=factor * self.steps, sample=factor * self.sample)
 
 
 def seen_by_photos(gathered: Gathered) -> Gathered:
@@ -239,7 +214,9 @@ class _LearningField(SemanticField, LearningDecoder):
         self.config, self.compression = config, compression or CompressionConfig()
 
     @classmethod
-    def build(cls, settings: Any, clip_dim: int, compression: Any, dense_dim: int) -> SemanticField:
+    def build(
+        cls, settings: SemanticFieldConfig, clip_dim: int, compression: CompressionConfig, dense_dim: int
+    ) -> SemanticField:
         return cls(settings, clip_dim, compression, dense_dim)
 
     def learning_steps(self, count: int) -> int:

@@ -6,9 +6,9 @@ from dataclasses import dataclass, field
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.settings_help import showing
-from lang3dxl_ns.components.compression import CompressedField, CompressionConfig, JointField
+from lang3dxl_ns.components.compression import CompressedField, JointField
 from lang3dxl_ns.components.feature_decoder import Decoder
-from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
+from lang3dxl_ns.components.field_settings import CompressionConfig, SemanticFieldConfig
 
 DECODERS: dict[str, type[Decoder]] = {"gathered": CompressedField, "paper": JointField}
 """Classes of feature decoders by name. Another one is added by the module that defines it."""

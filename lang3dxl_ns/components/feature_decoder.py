@@ -5,12 +5,12 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
+from lang3dxl_ns.components.field_settings import CompressionConfig, SemanticFieldConfig
 from lang3dxl_ns.components.principal_basis import PrincipalBasis
 
 Features = tuple[Float[Tensor, "*batch clip"], Float[Tensor, "*batch dense"] | None]
@@ -51,13 +51,18 @@ class Decoder(nn.Module, ABC):
         self.register_buffer("output_std", torch.ones(clip_dim + dense_dim))
 
     @classmethod
-    def build(cls, settings: Any, clip_dim: int, compression: Any, dense_dim: int) -> Decoder:
-        """Build a decoder for a run. settings, compression: the run's `SemanticFieldConfig` and
-        `CompressionConfig`, for decoders with a semantic field."""
+    def build(
+        cls, settings: SemanticFieldConfig, clip_dim: int, compression: CompressionConfig, dense_dim: int
+    ) -> Decoder:
+        """Build a decoder for a run. settings, compression: the run's, for decoders with a semantic field."""
         return cls(clip_dim, dense_dim)
 
     name = ""
     """Name of the decoder in `decoders.DECODERS`."""
+    settings: SemanticFieldConfig | None = None
+    """Settings of the decoder's semantic field; None if it has none."""
+    code_dim: int | None = None
+    """Channels of a code; None if any number will do."""
     bounded = False
     """Whether codes are squashed by a sigmoid before they are decoded."""
     per_gaussian = False

@@ -34,7 +34,7 @@ from lang3dxl_ns.common.files import expanded, file_locked, set_aside, slugs, wr
 from lang3dxl_ns.components.appearance import AppearanceConfig, AppearanceField
 from lang3dxl_ns.components.decoders import DecoderConfig, make_decoder
 from lang3dxl_ns.components.feature_decoder import Decoder
-from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
+from lang3dxl_ns.components.field_settings import SemanticFieldConfig
 from lang3dxl_ns.files import glb, spz
 from lang3dxl_ns.files.activations import log_scales, logits
 from lang3dxl_ns.query.question import QueryConfig
@@ -133,8 +133,7 @@ def _stored_splats(splats: Splats) -> dict[str, Array]:
 
 
 def _described_decoder(decoder: Decoder) -> dict[str, Any]:
-    settings = getattr(getattr(decoder, "field", decoder), "settings", None)
-    values = {} if settings is None else asdict(settings)
+    values = {} if decoder.settings is None else asdict(decoder.settings)
     values.pop("preset", None)  # all of its values are there
     described = {"name": decoder.name, "clip_dim": decoder.clip_dim, "dense_dim": decoder.dense_dim}
     return described | {"settings": values or None}
@@ -412,7 +411,7 @@ def _splats(file: _File) -> Splats:
 
 
 def _codes(file: _File, decoder: Decoder, count: int) -> Float[Tensor, "n d"]:
-    stored = file.tensor("codes", count, getattr(decoder, "code_dim", file.shapes["codes"][1]))
+    stored = file.tensor("codes", count, decoder.code_dim or file.shapes["codes"][1])
     if not decoder.bounded:
         return stored.float()
     expect(not stored.is_floating_point(), "its codes are no coordinates")

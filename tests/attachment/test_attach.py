@@ -16,7 +16,7 @@ from lang3dxl_ns.attachment.known_frames import known_frames
 from lang3dxl_ns.attachment.learn import prepare_photos, settled
 from lang3dxl_ns.commands.attach import Attach, _show
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.components.compression import CompressionConfig
+from lang3dxl_ns.components.field_settings import CompressionConfig
 from lang3dxl_ns.files.read_splats import read_splats
 from lang3dxl_ns.files.scene_file import read_scene
 from lang3dxl_ns.files.scene_file import write_scene as write_scene_file

@@ -11,7 +11,7 @@ from lab.benchmarks.scored_runs import apply_changes
 from lab.run_config import run_config
 from lang3dxl_ns.cli import main
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
+from lang3dxl_ns.components.field_settings import SemanticFieldConfig
 from lang3dxl_ns.methods import METHODS, lang3dxl
 from lang3dxl_ns.plugin.trainer import requested_checkpoint
 from lang3dxl_ns.preparation.settings import PreparationConfig

@@ -17,7 +17,7 @@ from lang3dxl_ns.commands.teach import forgotten
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import file_locked, locked, replace_file, set_aside
 from lang3dxl_ns.components.decoders import DecoderConfig, make_decoder
-from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
+from lang3dxl_ns.components.field_settings import SemanticFieldConfig
 from lang3dxl_ns.files.read_splats import read_splats
 from lang3dxl_ns.files.scene_file import Provenance, read_scene, replace_scene, write_scene
 from lang3dxl_ns.preparation.store import FeatureStore

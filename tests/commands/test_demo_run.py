@@ -11,7 +11,7 @@ import torch
 from lab.landmark import scene_writer
 from lab.landmark.demo import Demo
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
+from lang3dxl_ns.components.field_settings import SemanticFieldConfig
 from lang3dxl_ns.training.checkpoint import CHECKPOINT
 from lang3dxl_ns.training.fit import Run
 

@@ -5,7 +5,8 @@ import torch
 import torch.nn.functional as F
 
 from lang3dxl_ns.components.code_search import nearest, settle
-from lang3dxl_ns.components.semantic_field import SemanticField, SemanticFieldConfig
+from lang3dxl_ns.components.field_settings import SemanticFieldConfig
+from lang3dxl_ns.components.semantic_field import SemanticField
 
 CHANNELS = 12
 

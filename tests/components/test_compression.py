@@ -9,17 +9,11 @@ import torch.nn.functional as F
 from numerics.compression import compress
 
 from lang3dxl_ns.components import compression
-from lang3dxl_ns.components.compression import (
-    CompressedField,
-    CompressionConfig,
-    JointField,
-    centered_cosine,
-    draw_sample,
-    fit,
-)
+from lang3dxl_ns.components.compression import CompressedField, JointField, centered_cosine, draw_sample, fit
 from lang3dxl_ns.components.feature_decoder import Gathered
+from lang3dxl_ns.components.field_settings import CompressionConfig, SemanticFieldConfig
 from lang3dxl_ns.components.principal_basis import PrincipalBasis
-from lang3dxl_ns.components.semantic_field import SemanticField, SemanticFieldConfig
+from lang3dxl_ns.components.semantic_field import SemanticField
 from lang3dxl_ns.training.learn_codes import TargetView, learn_codes
 
 CHANNELS = 24

@@ -6,7 +6,7 @@ import torch
 from lab.baselines import langsplat
 from lab.baselines.fmgs import neighbor_similarity, pixel_alignment_loss
 from lang3dxl_ns.components.decoders import DECODERS, DecoderConfig, make_decoder
-from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
+from lang3dxl_ns.components.field_settings import SemanticFieldConfig
 
 NAMES = [name for name, kind in DECODERS.items() if not kind.needs_lifting]
 CLIP, DENSE = 16, 6

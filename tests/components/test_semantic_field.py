@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.components.semantic_field import PRESETS, SemanticField, SemanticFieldConfig
+from lang3dxl_ns.components.field_settings import PRESETS, SemanticFieldConfig
+from lang3dxl_ns.components.semantic_field import SemanticField
 
 # Every preset, at a size affordable in a test.
 CONFIGS = {

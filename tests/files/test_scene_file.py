@@ -27,7 +27,7 @@ from lab.baselines import BASELINES
 from lang3dxl_ns.commands.view import Info
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.components.decoders import DecoderConfig, make_decoder
-from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
+from lang3dxl_ns.components.field_settings import SemanticFieldConfig
 from lang3dxl_ns.files.scene_file import Provenance, describe_scene_file, read_scene, write_scene
 from lang3dxl_ns.files.splat_file import write_splats
 from lang3dxl_ns.query.relevancy import TEMPERATURE

@@ -9,10 +9,11 @@ import torch
 from torch import Tensor
 
 from lab.numerics.measure import Bounds, Case, Maps, Problem
-from lang3dxl_ns.components.compression import CompressionConfig, assign, draw_sample, fit, seen_by_photos
+from lang3dxl_ns.components.compression import assign, draw_sample, fit, seen_by_photos
 from lang3dxl_ns.components.feature_decoder import Gathered
+from lang3dxl_ns.components.field_settings import CompressionConfig, SemanticFieldConfig
 from lang3dxl_ns.components.principal_basis import PrincipalBasis
-from lang3dxl_ns.components.semantic_field import SemanticField, SemanticFieldConfig
+from lang3dxl_ns.components.semantic_field import SemanticField
 
 COUNT, CHANNELS, KINDS = 2_000, 32, 12
 RARE = 0.005

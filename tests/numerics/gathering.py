@@ -11,7 +11,7 @@ from torch import Tensor
 
 from lab.numerics.measure import EXACT, Bounds, Case, Maps, Problem
 from lang3dxl_ns.components.compression import CompressedField
-from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
+from lang3dxl_ns.components.field_settings import SemanticFieldConfig
 from lang3dxl_ns.query.engine import PerGaussian
 from lang3dxl_ns.query.relevancy import Queries
 from lang3dxl_ns.rendering import Gaussians, rasterize

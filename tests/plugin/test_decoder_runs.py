@@ -8,9 +8,8 @@ from nerfstudio.utils.eval_utils import eval_setup
 from runs import train_run
 
 from lab.baselines import BASELINES, langsplat
-from lang3dxl_ns.components.compression import CompressionConfig
 from lang3dxl_ns.components.decoders import DecoderConfig
-from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
+from lang3dxl_ns.components.field_settings import CompressionConfig, SemanticFieldConfig
 from lang3dxl_ns.evaluation.score_run import score_features
 from lang3dxl_ns.plugin.cameras import photo_camera
 from lang3dxl_ns.rendering import composite

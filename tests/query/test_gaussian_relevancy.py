@@ -5,7 +5,7 @@ import torch
 import torch.nn.functional as F
 
 from lang3dxl_ns.components.compression import CompressedField
-from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
+from lang3dxl_ns.components.field_settings import SemanticFieldConfig
 from lang3dxl_ns.query.engine import PerGaussian, make_engine
 from lang3dxl_ns.query.relevancy import Queries
 from lang3dxl_ns.rendering import Gaussians, rasterize

@@ -3,7 +3,8 @@
 import pytest
 import torch
 
-from lang3dxl_ns.components.semantic_field import SemanticField, SemanticFieldConfig
+from lang3dxl_ns.components.field_settings import SemanticFieldConfig
+from lang3dxl_ns.components.semantic_field import SemanticField
 from lang3dxl_ns.query import relevancy as module
 from lang3dxl_ns.query.relevancy import TEMPERATURE, Queries, cosines_of_codes
 

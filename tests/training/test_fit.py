@@ -13,7 +13,7 @@ import torch
 from scenes import write_scene
 
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
+from lang3dxl_ns.components.field_settings import SemanticFieldConfig
 from lang3dxl_ns.files.scene_file import read_scene
 from lang3dxl_ns.scene.capture import open_capture
 from lang3dxl_ns.training import fit as fitting

@@ -20,7 +20,7 @@ from painted_scene import (
 from PIL import Image
 
 from lang3dxl_ns.components.compression import CompressedField
-from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
+from lang3dxl_ns.components.field_settings import SemanticFieldConfig
 from lang3dxl_ns.files.scene_file import read_scene
 from lang3dxl_ns.web.serve import PageServer
 from lang3dxl_ns.web.teach import PageWords
