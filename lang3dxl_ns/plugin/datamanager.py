@@ -35,6 +35,7 @@ from lang3dxl_ns.preparation.needs import needs_table
 from lang3dxl_ns.preparation.settings import PreparationConfig
 from lang3dxl_ns.preparation.targets import FACTS, Batch, SceneFacts
 from lang3dxl_ns.scene.camera import LONGEST_SIDE
+from lang3dxl_ns.scene.capture import open_capture
 from lang3dxl_ns.scene.companions import cache_folder
 from lang3dxl_ns.scene.record import SCENE_FILE, SceneRecord
 from lang3dxl_ns.training.batches import TrainingData
@@ -92,27 +93,18 @@ class Lang3DXLDataManager(FullImageDatamanager):
         opens = kwargs.get("test_mode", "val") != "val"
         recorded = recorded_scene(config.run) if opens else None
         try:
-            # never find a run's own cameras anew: its Gaussians would not match them
+            # Never find a run's own cameras anew: its Gaussians would not match them.
             config.dataparser = parser_for(config.dataparser, config.cache_dir, config.run is None)
             config.data = config.dataparser.data
-            super().__init__(config, *args, **kwargs)
             if recorded is not None:
-                self._check_recorded(SceneRecord.read(recorded.run / SCENE_FILE))
+                _check_recorded(config.dataparser, recorded.run)
         except (UserError, FileNotFoundError) as reason:
             if recorded is None:
                 raise
             say(f"The run's own cameras are used: {reason}")
             config.dataparser, config.camera_res_scale_factor = recorded, 1.0
             config.longer_side = LONGEST_SIDE  # the recorded cameras have the size of training
-            super().__init__(config, *args, **kwargs)
-
-    def _check_recorded(self, scene: SceneRecord) -> None:
-        """Raise UserError if the photos are no longer those that the run was trained on: nerfstudio would
-        find another frame for the cameras, or hold other photos out."""
-        capture, frame = self.data.capture, self.data.capture.recorded_frame
-        trained = {photo.name for photo in scene.photos if photo.split == "train"}
-        if not scene.has_frame(frame.transform, frame.scale) or set(capture.split.train) != trained:
-            raise UserError(f"photos or cameras in {capture.folder} are not those of the run's training")
+        super().__init__(config, *args, **kwargs)
 
     def get_datapath(self) -> Path:
         """Return the folder where the viewer keeps camera paths, which is the run's."""
@@ -179,3 +171,13 @@ class Lang3DXLDataManager(FullImageDatamanager):
     def get_train_rays_per_batch(self) -> int:
         """Return the pixels of a typical photo, for nerfstudio's speed display."""
         return int((self.train_dataset.cameras.width * self.train_dataset.cameras.height).float().mean())
+
+
+def _check_recorded(config: PhotoCollectionDataParserConfig, run: Path) -> None:
+    """Raise UserError if the photos are no longer those that the run was trained on: nerfstudio would find
+    another frame for the cameras, or hold other photos out."""
+    capture = open_capture(config.data, config, may_reconstruct=False)
+    scene, frame = SceneRecord.read(run / SCENE_FILE), capture.recorded_frame
+    trained = {photo.name for photo in scene.photos if photo.split == "train"}
+    if not scene.has_frame(frame.transform, frame.scale) or set(capture.split.train) != trained:
+        raise UserError(f"photos or cameras in {capture.folder} are not those of the run's training")
