@@ -76,6 +76,8 @@ _DATA = re.compile(
     r"(bin|json|jpg)"
 )
 """Names of a page's data files. Nothing else in its folder is ever deleted."""
+_Part = tuple[dict[str, Any], dict[str, bytes]]
+"""What scene.json tells of a part of a page, and the content of the part's files by name."""
 MOST_TEXT = 2_000
 """Most characters of a phrase, of which CLIP reads about 300."""
 
@@ -117,8 +119,9 @@ class Page:
         scene, within = self.scene, self.scene.config.foreground
         self.prompts = prompts_of(scene, list(self.texts)) if self.texts else []
         self._foreground = prompts_of(scene, within) if within else []
-        self._looks = list(scene.looks.names) if scene.looks else []
         self._toward = scene.overview.camera.position.to(scene.device)
+        means = scene.splats.means[scene.splats.sound()]
+        self._center = means.median(0).values if len(means) else self._toward
         self._meaning: pack.PackedMeaning | None = None
         if scene.decoder is not None and scene.codes is not None:
             self._meaning = pack.packed_meaning(scene.decoder, scene.codes)
@@ -127,75 +130,127 @@ class Page:
 
     def files(self) -> dict[str, bytes]:
         """Build the content of every file, by name."""
-        scene, self.left_out = self.scene, []
-        means = scene.splats.means[scene.splats.sound()]
-        center = means.median(0).values if len(means) else self._toward
+        self.left_out = []
+        about = dict[str, Any]()
         files = {path.name: path.read_bytes() for path in _FILES}
         files["language.js"] = language_module()
         files["spark.bin"] = gzip.compress(_LIBRARY.read_bytes(), mtime=0)
-        files["splats.bin"] = pack.splat_bytes(scene.baked(self.look), center, self._toward).tobytes()
-        told = self.provenance
-        about: dict[str, Any] = {
+        parts = self._whole, self._details, self._photos, self._lightings, self._meanings, self._views
+        for part in parts:
+            told, made = part()
+            about |= told
+            files |= made
+        files["scene.json"] = json.dumps(about | {"left_out": self.left_out}).encode()
+        return files
+
+    # ── parts: what scene.json tells of each, and its files ─────────────────────────────────────────────
+
+    def _whole(self) -> _Part:
+        """Describe the scene and the page, with the splats that load first."""
+        scene, told = self.scene, self.provenance
+        about = {
             "title": told.title or Path(scene.file.data).name,
             **{"credit": told.credit, "license": told.license, "made": told.made_how},
             "count": len(scene.splats),
-            "center": center.tolist(),
+            "center": self._center.tolist(),
             "antialiased": scene.splats.antialiased,
             "background": [0, 0, 0] if scene.background is None else scene.background.tolist(),
             "up": find.up_of(scene).tolist(),
             "edges": find.axes_of(scene).tolist(),
             "heights": find.heights_of(scene).tolist(),
+            "extent": extent(scene),
             "tour": told.tour,
             "meters": None if scene.file.georeference is None else asdict(scene.file.georeference),
             "start": pack.camera_json(scene.overview.full_camera),
+            "source": {"scene": Path(scene.file.data).name, "clip": scene.file.clip_identity},
             "colors": PROMPT_COLORS,
             "live": self.live,
             "prompts": _phrases(self.prompts),
-            "words": None,
-            "names": [],
-            "suggested": [],
         }
-        if self.levels is not None:
-            files |= self._chunks(self.levels, center)
-            bounds = [self.levels.bounds(number) for number in range(self.levels.chunks)]
-            about["detail"] = {"rows": self.levels.rows, "chunks": bounds, "count": len(self.whole.splats)}
-        files |= self._photos(about)
-        about["floaters"] = "api/floaters" if self.live else "floaters.bin"
-        about["looks"] = {name: f"api/look?photo={quote(name)}" for name in self._looks}
-        if not self.live:  # without a server the lightings are files, read when they are chosen
-            files["floaters.bin"] = self.floaters()
-            chosen = self._within_limits("lightings", self._looks, [4 * len(scene.splats)] * len(self._looks))
-            about["looks"] = {name: f"look{i}.bin" for i, name in enumerate(chosen)}
-            files |= {f"look{i}.bin": self.colors(name) for i, name in enumerate(chosen)}
-        if self._meaning is not None:
-            about["words"] = self._meaning.description | {
-                "temperature": scene.engine.temperature,
-                "threshold": scene.config.threshold,
-                "unrelated": scene.doubts.unrelated.tolist(),
-                "gap": scene.gap,
-                "covered": scene.config.min_alpha,
-                "rules": _RULES,
-                "foreign": scene.foreignness,
-                "pixels": [pack.LEAST_PIXELS, pack.PIXEL_STEPS],
-            }
-            files |= self._meaning.files | self._vocabulary(self._meaning)
-            packed = {name: pack.view_bytes(view, len(scene.splats)) for name, view in scene.visible.items()}
-            views = self._within_limits("views", list(packed), list(map(len, packed.values())))
-            files["views.bin"] = b"".join(packed[name] for name in views)
-            about["views"] = [
-                {"name": name, "bytes": len(packed[name]), **pack.camera_json(scene.visible[name].camera)}
-                for name in views
-            ]
-            about["foreground"] = _phrases(self._foreground)
-            if self._foreground:
-                within = scene.ask(self._foreground, foreground="").gaussians.any(0)
-                files["foreground.bin"] = within.byte().cpu().numpy().tobytes()
-            named = _distinct([*(word.name for word in scene.words.values()), *self.words, *self.more])
-            about["names"] = [name for name in named if phrases_of(name) != [(name, [])]]
-            about["suggested"] = self._suggested()
-        about["left_out"] = self.left_out
-        files["scene.json"] = json.dumps(about).encode()
-        return files
+        splats = pack.splat_bytes(scene.baked(self.look), self._center, self._toward)
+        return about, {"splats.bin": splats.tobytes()}
+
+    def _details(self) -> _Part:
+        """Pack the chunks that show more detail: splats, floaters, and what the Gaussians mean."""
+        if (levels := self.levels) is None:
+            return {}, {}
+        files, colored = dict[str, bytes](), [scene.baked(self.look) for scene in levels.scenes]
+        for number in tracked(range(1, levels.chunks), "packing details"):
+            scene, rows = levels.chunk(number)
+            splats = colored[levels.scenes.index(scene)].select(torch.arange(rows.start, rows.stop))
+            packed = pack.splat_bytes(splats, self._center, self._toward).tobytes()
+            parts = [packed, _bytes(scene.floating[rows])]
+            if scene.decoder is not None and scene.codes is not None:
+                meaning = pack.packed_meaning(scene.decoder, scene.codes[rows]).files
+                parts.append(meaning.get("codes.bin") or meaning["rows.bin"])
+            files[f"part{number}.bin"] = b"".join(parts)
+        bounds = [levels.bounds(number) for number in range(levels.chunks)]
+        return {"detail": {"rows": levels.rows, "chunks": bounds, "count": len(self.whole.splats)}}, files
+
+    def _photos(self) -> _Part:
+        """Describe the photos' cameras, and make small photos if asked for."""
+        names, files = dict[str, str](), dict[str, bytes]()
+        shown = photos_shown(self.scene)
+        if self.photos is not None and self.live:
+            names = {photo.name: f"api/photo?name={quote(photo.name)}" for photo in shown}
+        elif self.photos is not None:
+            made = {p.name: small_photo(p, self.photos) for p in tracked(shown, "reading photos")}
+            chosen = self._within_limits("photos", list(made), list(map(len, made.values())))
+            names = {name: f"photo{i}.jpg" for i, name in enumerate(chosen)}
+            files = {file: made[name] for name, file in names.items()}
+        return {"cameras": [photo_json(photo, names.get(photo.name)) for photo in shown]}, files
+
+    def _lightings(self) -> _Part:
+        """Tell where floaters and lightings are: without a server they are files, read when chosen."""
+        looks = list(self.scene.looks.names) if self.scene.looks else []
+        if self.live:
+            served = {name: f"api/look?photo={quote(name)}" for name in looks}
+            return {"floaters": "api/floaters", "looks": served}, {}
+        chosen = self._within_limits("lightings", looks, [4 * len(self.scene.splats)] * len(looks))
+        names = {name: f"look{i}.bin" for i, name in enumerate(chosen)}
+        files = {file: self.colors(name) for name, file in names.items()}
+        return {"floaters": "floaters.bin", "looks": names}, files | {"floaters.bin": self.floaters()}
+
+    def _meanings(self) -> _Part:
+        """Pack what Gaussians mean, and the words that the page knows and offers."""
+        scene, meaning = self.scene, self._meaning
+        if meaning is None:
+            return {"words": None, "names": [], "suggested": []}, {}
+        rules = {
+            "temperature": scene.engine.temperature,
+            "threshold": scene.config.threshold,
+            "unrelated": scene.doubts.unrelated.tolist(),
+            "gap": scene.gap,
+            "covered": scene.config.min_alpha,
+            "rules": _RULES,
+            "foreign": scene.foreignness,
+            "pixels": [pack.LEAST_PIXELS, pack.PIXEL_STEPS],
+        }
+        named = _distinct([*(word.name for word in scene.words.values()), *self.words, *self.more])
+        about = {
+            "words": meaning.description | rules,
+            "foreground": _phrases(self._foreground),
+            "names": [name for name in named if phrases_of(name) != [(name, [])]],
+            "suggested": self._suggested(),
+        }
+        files = meaning.files | self._vocabulary(meaning)
+        if self._foreground:
+            within = scene.ask(self._foreground, foreground="").gaussians.any(0)
+            files["foreground.bin"] = within.byte().cpu().numpy().tobytes()
+        return about, files
+
+    def _views(self) -> _Part:
+        """Pack the views that the page flies to, if it can be asked."""
+        if self._meaning is None:
+            return {}, {}
+        visible, count = self.scene.visible, len(self.scene.splats)
+        packed = {name: pack.view_bytes(view, count) for name, view in visible.items()}
+        names = self._within_limits("views", list(packed), list(map(len, packed.values())))
+        views = [
+            {"name": name, "bytes": len(packed[name]), **pack.camera_json(visible[name].camera)}
+            for name in names
+        ]
+        return {"views": views}, {"views.bin": b"".join(packed[name] for name in names)}
 
     def _suggested(self) -> list[str]:
         """List words that the scene answers surely, each with matches of its own: taught ones come first."""
@@ -207,35 +262,6 @@ class Page:
             if trust.level == "sure" and bool(own.any()) and not bool(same.any()):
                 chosen.append(row)
         return [words[row] for row in chosen]
-
-    def _chunks(self, levels: Levels, center: Float[Tensor, "3"]) -> dict[str, bytes]:
-        """Pack the chunks that show more detail: splats, floaters, and what the Gaussians mean."""
-        files, colored = dict[str, bytes](), [scene.baked(self.look) for scene in levels.scenes]
-        for number in tracked(range(1, levels.chunks), "packing details"):
-            scene, rows = levels.chunk(number)
-            splats = colored[levels.scenes.index(scene)].select(torch.arange(rows.start, rows.stop))
-            parts = [pack.splat_bytes(splats, center, self._toward).tobytes(), _bytes(scene.floating[rows])]
-            if scene.decoder is not None and scene.codes is not None:
-                packed = pack.packed_meaning(scene.decoder, scene.codes[rows]).files
-                parts.append(packed.get("codes.bin") or packed["rows.bin"])
-            files[f"part{number}.bin"] = b"".join(parts)
-        return files
-
-    def _photos(self, about: dict[str, Any]) -> dict[str, bytes]:
-        """Describe the photos' cameras and what the overview shows, and make small photos if asked for."""
-        scene, names, files = self.scene, dict[str, str](), dict[str, bytes]()
-        shown = photos_shown(scene)
-        if self.photos is not None and self.live:
-            names = {photo.name: f"api/photo?name={quote(photo.name)}" for photo in shown}
-        elif self.photos is not None:
-            made = {p.name: small_photo(p, self.photos) for p in tracked(shown, "reading photos")}
-            chosen = self._within_limits("photos", list(made), list(map(len, made.values())))
-            names = {name: f"photo{i}.jpg" for i, name in enumerate(chosen)}
-            files = {file: made[name] for name, file in names.items()}
-        about["cameras"] = [photo_json(photo, names.get(photo.name)) for photo in shown]
-        about["extent"] = extent(scene)
-        about["source"] = {"scene": Path(scene.file.data).name, "clip": scene.file.clip_identity}
-        return files
 
     def _within_limits(self, what: str, names: list[str], sizes: list[int]) -> list[str]:
         """Choose evenly spaced names that take at most `_MOST_BYTES`, and record how many are left out."""
