@@ -70,19 +70,22 @@ def join(pieces: Sequence[Piece], weight: Float[Array, " n"], box: Callable[[Joi
     # Photos that show a thing, and those that show two in one piece.
     seen = defaultdict[tuple[int, ...], set[str]](set)
     for piece in sorted(pieces, key=lambda piece: (piece.cut, -piece.resolution)):
-        mine, total = owner[piece.rows], weight[piece.rows].sum()
+        owners, weights = owner[piece.rows], weight[piece.rows]
+        owned, total = owners >= 0, weights.sum()
         if total <= 0:
             continue
-        shared = np.bincount(mine[mine >= 0], weight[piece.rows][mine >= 0], minlength=len(things))
-        of_things = shared / np.array([thing.weight for thing in things]) if things else shared
-        covered = np.flatnonzero(of_things > SHARED).tolist()
-        best, single = int(shared.argmax()) if things else -1, len(covered) < 2
-        if single and things and (shared[best] > SHARED * total or of_things[best] > SHARED):
-            if of_things[best] >= SPLINTER and not (piece.cut and of_things[best] <= SHARED):
-                things[best].votes.append(piece)
-                covered = [best]
-        elif single and not piece.cut and shared.sum() <= SHARED * total:
-            rows = piece.rows[mine < 0]
+        shared = np.bincount(owners[owned], weights[owned], minlength=len(things))
+        shares = shared / np.array([thing.weight for thing in things])
+        covered = np.flatnonzero(shares > SHARED).tolist()
+        single, nearest = len(covered) < 2, int(shared.argmax()) if things else -1
+        same = things and single and (shared[nearest] > SHARED * total or shares[nearest] > SHARED)
+        confirms = same and (shares[nearest] > SHARED or (not piece.cut and shares[nearest] >= SPLINTER))
+        founds = single and not same and not piece.cut and shared.sum() <= SHARED * total
+        if confirms:
+            things[nearest].votes.append(piece)
+            covered = [nearest]
+        elif founds:
+            rows = piece.rows[~owned]
             owner[rows], covered = len(things), [len(things)]
             things.append(Joined(rows, float(weight[rows].sum()), [piece]))
         for some in (*combinations(covered, 1), *combinations(covered, 2)):
