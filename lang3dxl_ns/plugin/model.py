@@ -175,8 +175,12 @@ class Lang3DXLModel(SplatfactoModel):
         self, camera: Cameras, asked: Float[Tensor, "n d"] | None, colors: Float[Tensor, "n 3"] | None
     ) -> tuple[Rendering, dict[str, Tensor]]:
         """Return a rendering with the channels `asked`, and the outputs of nerfstudio's viewer."""
-        parts = [part for part in (asked, colors) if part is not None]
-        rendering = self.seen(camera, channels=torch.cat(parts, dim=1) if parts else None)
+        named = {name: part for name, part in (("asked", asked), ("colors", colors)) if part is not None}
+        rendering = self.seen(camera, torch.cat(list(named.values()), dim=1) if named else None)
+        maps = dict[str, Tensor]()
+        if rendering.channels is not None:
+            widths = [part.shape[1] for part in named.values()]
+            maps = dict(zip(named, rendering.channels.split(widths, dim=2), strict=True))
         background, depth = self._get_background_color().expand_as(rendering.rgb), rendering.depth
         outputs = {
             "rgb": rendering.rgb,
@@ -186,11 +190,8 @@ class Lang3DXLModel(SplatfactoModel):
         }
         if self.semantic_field is not None:
             # This output exists from the first rendering on, since viewers list that rendering's outputs.
-            outputs["bottleneck"] = background
-        if rendering.channels is not None and colors is not None:
-            channels, outputs["bottleneck"] = rendering.channels.tensor_split([-3], dim=2)
-            rendering = replace(rendering, channels=None if asked is None else channels)
-        return rendering, outputs
+            outputs["bottleneck"] = maps.get("colors", background)
+        return replace(rendering, channels=maps.get("asked")), outputs
 
     def _code_colors(self) -> Float[Tensor, "n 3"] | None:
         if self.run.carried is None or self.semantic_field is None:
