@@ -136,8 +136,7 @@ class Page:
         files["language.js"] = language_module()
         files["spark.bin"] = gzip.compress(_LIBRARY.read_bytes(), mtime=0)
         parts = self._whole, self._details, self._photos, self._lightings, self._meanings, self._views
-        for part in parts:
-            told, made = part()
+        for told, made in (part() for part in parts):
             about |= told
             files |= made
         files["scene.json"] = json.dumps(about | {"left_out": self.left_out}).encode()
@@ -178,8 +177,8 @@ class Page:
         for number in tracked(range(1, levels.chunks), "packing details"):
             scene, rows = levels.chunk(number)
             splats = colored[levels.scenes.index(scene)].select(torch.arange(rows.start, rows.stop))
-            packed = pack.splat_bytes(splats, self._center, self._toward).tobytes()
-            parts = [packed, _bytes(scene.floating[rows])]
+            drawn = pack.splat_bytes(splats, self._center, self._toward).tobytes()
+            parts = [drawn, _bytes(scene.floating[rows])]
             if scene.decoder is not None and scene.codes is not None:
                 meaning = pack.packed_meaning(scene.decoder, scene.codes[rows]).files
                 parts.append(meaning.get("codes.bin") or meaning["rows.bin"])
@@ -243,13 +242,10 @@ class Page:
         """Pack the views that the page flies to, if it can be asked."""
         if self._meaning is None:
             return {}, {}
-        visible, count = self.scene.visible, len(self.scene.splats)
-        packed = {name: pack.view_bytes(view, count) for name, view in visible.items()}
+        seen, count = self.scene.visible, len(self.scene.splats)
+        packed = {name: pack.view_bytes(view, count) for name, view in seen.items()}
         names = self._within_limits("views", list(packed), list(map(len, packed.values())))
-        views = [
-            {"name": name, "bytes": len(packed[name]), **pack.camera_json(visible[name].camera)}
-            for name in names
-        ]
+        views = [{"name": n, "bytes": len(packed[n]), **pack.camera_json(seen[n].camera)} for n in names]
         return {"views": views}, {"views.bin": b"".join(packed[name] for name in names)}
 
     def _suggested(self) -> list[str]:
