@@ -9,9 +9,9 @@ import numpy as np
 import torch
 
 from lang3dxl_ns.attachment import AttachConfig
-from lang3dxl_ns.attachment.frames import camera_in, find_frame, side_by_side
+from lang3dxl_ns.attachment.frames import find_frame, side_by_side
 from lang3dxl_ns.attachment.known_frames import Similarity
-from lang3dxl_ns.attachment.learn import learn, prepare_photos, scene_file, settled
+from lang3dxl_ns.attachment.learn import learn, photos_of, scene_file, settled
 from lang3dxl_ns.attachment.segment import segmented
 from lang3dxl_ns.attachment.views import rendered_views
 from lang3dxl_ns.common.console import say, some
@@ -83,21 +83,22 @@ def attach(
             similarity = _frame(splats, collection, path, place)
     with stages.stage("prepare"):
         cache = cache_folder(collection.folder, config.cache_dir)
-        collection, targets = prepare_photos(collection, preparation, cache, worker)
-    tracked, photos = collection.reconstruction.photos, collection.photos
-    cameras = {p.name: camera_in(similarity, tracked[p.name].resized(p.width, p.height)) for p in photos}
+        prepared = photos_of(collection, similarity, preparation, cache, worker)
+        assert prepared.targets is not None
+        photos = [prepared.photos[name] for name in prepared.targets.names]
     with stages.stage("learn"):
-        decoder, codes = learn(splats, collection, cameras, targets)
+        decoder, codes = learn(splats, prepared)
     shown = f"{len(photos)} {'views' if data is None else 'photos'}"
     seen = float(codes.isfinite().all(1).float().mean())
     where = " in their foreground" if any(photo.mask_path for photo in photos) else ""
     say(f"{shown} show {seen:.0%} of the Gaussians{where}; the others match nothing")
-    file = scene_file(collection, cameras, similarity, preparation)
+    file = scene_file(prepared)
     visible = None if place is None else place.with_name(f".{place.stem}.visible")
     scene = Scene(splats, file, decoder, codes, cache=visible)
     if found is not None:
         with stages.stage("segment"):
             segmenter = load_text_segmenter(found, worker)
+            cameras = {photo.name: prepared.views[photo.name].camera() for photo in photos}
             for word in config.segment:
                 scene = segmented(scene, word, segmenter, photos, cameras)
     if place is not None:
@@ -118,6 +119,8 @@ def _check_request(config: AttachConfig, data: str | Path | None, place: Path | 
         check_scene_name(place)
     elif data is None:
         raise UserError("views of the splat are kept beside its scene: name the file to write (out)")
+    if config.clip == "none":
+        raise UserError("words come from an image-text encoder: leave --clip none off")
     check_data(None if data is None else Path(data))
 
 

@@ -16,12 +16,12 @@ from lang3dxl_ns.common.device import in_full_precision
 from lang3dxl_ns.components.feature_decoder import Gathered, LearningDecoder
 from lang3dxl_ns.components.principal_basis import PrincipalBasis
 from lang3dxl_ns.preparation.targets import Batch, foreground
-from lang3dxl_ns.rendering import composite
+from lang3dxl_ns.rendering import Splats, composite
 from lang3dxl_ns.rendering.gathering import Composite, Pixels, gather
-from lang3dxl_ns.scene.camera import resized
+from lang3dxl_ns.scene.camera import Camera, resized
 from lang3dxl_ns.training.batches import TrainingData
 from lang3dxl_ns.training.sharpening import sharpen
-from lang3dxl_ns.training.state import PhotoCamera, Training
+from lang3dxl_ns.training.state import Training
 
 DENSE_AXES = 32
 """Number of principal components of the dense features by which groups are formed."""
@@ -60,7 +60,11 @@ def learn_words(run: Training, data: TrainingData) -> None:
     semantics, facts = run.parts.semantics, run.facts
     assert semantics is not None and facts.clip_targets is not None
     assert isinstance(semantics.decoder, LearningDecoder)
-    views = (_target_view(run, *photo) for photo in data.every_photo())
+    splats = run.splats()
+    views = (
+        target_view(splats, view.camera(run.pose(view)).detach(), LONGER_SIDE, batch)
+        for view, batch in data.every_photo()
+    )
     means = run.gaussians["means"].detach()
     # Initial codes are fitted to the unsharpened targets, which the loss compares with.
     dense = None if run.learns_from_renderings else facts.dense_targets
@@ -77,9 +81,10 @@ def forget_words(run: Training) -> None:
         del run.gaussians["codes"]
 
 
-def _target_view(run: Training, view: PhotoCamera, batch: Batch) -> TargetView:
-    camera = resized(view.camera(run.pose(view)).detach(), LONGER_SIDE)
-    seen, size = partial(composite, run.splats(), camera), (camera.height, camera.width)
+def target_view(splats: Splats, camera: Camera, longer_side: int, batch: Batch) -> TargetView:
+    """Return a photo's targets as a view of the splats, from its camera at most this large, pixels."""
+    camera = resized(camera, longer_side)
+    seen, size = partial(composite, splats, camera), (camera.height, camera.width)
     return TargetView(seen, size, batch["clip_target"], batch.get("dense_target"), foreground(batch))
 
 

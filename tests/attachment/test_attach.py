@@ -13,7 +13,7 @@ from scenes import write_scene
 from lang3dxl_ns.attachment import AttachConfig
 from lang3dxl_ns.attachment.attach import attach
 from lang3dxl_ns.attachment.known_frames import known_frames
-from lang3dxl_ns.attachment.learn import prepare_photos, settled
+from lang3dxl_ns.attachment.learn import photos_of, settled
 from lang3dxl_ns.commands.attach import Attach, _show
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.components.field_settings import CompressionConfig
@@ -213,6 +213,9 @@ def test_settings_that_attaching_does_not_read_and_impossible_words_are_told_bef
 def test_large_photos_are_prepared_at_the_requested_size(tmp_path):
     write_scene(tmp_path / "photos", size=(320, 240), photos=3, points=200, coarseness=4)
     config = settled(replace(SETTINGS, longer_side=120))
-    photos, targets = prepare_photos(open_capture(tmp_path / "photos"), config, tmp_path / "cache", "cpu")
-    assert {(photo.width, photo.height) for photo in photos.photos} == {(120, 90)}
+    capture = open_capture(tmp_path / "photos")
+    data = photos_of(capture, np.eye(4), config, tmp_path / "cache", "cpu")
+    targets = data.targets
+    assert list(data.photos) == capture.names
+    assert {(photo.width, photo.height) for photo in data.photos.values()} == {(120, 90)}
     assert targets.clip(targets.names[0]).features.shape[0] < targets.clip(targets.names[0]).features.shape[1]
