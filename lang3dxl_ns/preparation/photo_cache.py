@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Hashable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
@@ -18,45 +18,47 @@ PATIENCE_S = (1.0, 5.0, 15.0)
 
 class PhotoCache:
     """Cache that keeps the first decoded photos that fit into `max_bytes`, and reads the others ahead, in a
-    number of threads (`readers`), in the order of use. `read` reads a photo's data by its index.
+    number of threads (`readers`), in the order of use. `read` reads a photo's data by its key; a `patient`
+    cache waits for files that have vanished.
 
     Photos come in shuffled rounds, and each round uses every photo once. So a cache of the latest ones would
     hardly ever hit, while photos that are kept for good hit in proportion to their number.
     """
 
-    def __init__(self, read: Callable[[int], dict[str, Any]], max_bytes: float, readers: int = 4):
-        self._read = read
-        self._free = max_bytes
-        self._kept: dict[int, dict[str, Any]] = {}
-        self._ahead: dict[int, Future[dict[str, Any]]] = {}
+    def __init__(
+        self, read: Callable[[Any], dict[str, Any]], max_bytes: float, readers: int = 4, patient: bool = True
+    ) -> None:
+        self._read, self._free, self._patient = read, max_bytes, patient
+        self._kept: dict[Hashable, dict[str, Any]] = {}
+        self._ahead: dict[Hashable, Future[dict[str, Any]]] = {}
         self._pool = ThreadPoolExecutor(readers, thread_name_prefix="photo-reader")
 
-    def get(self, index: int, upcoming: list[int]) -> dict[str, Any]:
-        """Return the photo at `index`, with retries if its file has vanished; start reading `upcoming`."""
-        for i in (index, *upcoming):
-            if i not in self._kept and i not in self._ahead:
-                self._ahead[i] = self._pool.submit(self._read, i)
-        data = self._kept[index] if index in self._kept else self._patiently(index)
-        for i in self._ahead.keys() - set(upcoming):
-            self._ahead.pop(i).cancel()
-        if index not in self._kept:
+    def get(self, key: Hashable, upcoming: Sequence[Hashable]) -> dict[str, Any]:
+        """Return a photo's data, with retries if its file has vanished; start reading `upcoming`."""
+        for each in (key, *upcoming):
+            if each not in self._kept and each not in self._ahead:
+                self._ahead[each] = self._pool.submit(self._read, each)
+        data = self._kept[key] if key in self._kept else self._patiently(key)
+        for each in self._ahead.keys() - set(upcoming):
+            self._ahead.pop(each).cancel()
+        if key not in self._kept:
             size = sum(value.nbytes for value in data.values() if isinstance(value, Tensor))
             if size <= self._free:
-                self._kept[index], self._free = data, self._free - size
+                self._kept[key], self._free = data, self._free - size
         return dict(data)
 
-    def _patiently(self, index: int) -> dict[str, Any]:
+    def _patiently(self, key: Hashable) -> dict[str, Any]:
         """Wait for a photo's data, with retries if its files have vanished."""
-        for seconds in PATIENCE_S:
+        for seconds in PATIENCE_S if self._patient else ():
             try:
-                return self._ahead[index].result()
+                return self._ahead[key].result()
             except UserError as reason:
                 if not has_vanished(reason):
                     raise
                 say(f"{reason}; retrying in {seconds:.0f} s")
             time.sleep(seconds)
-            self._ahead[index] = self._pool.submit(self._read, index)
-        return self._ahead[index].result()
+            self._ahead[key] = self._pool.submit(self._read, key)
+        return self._ahead[key].result()
 
 
 def has_vanished(reason: UserError) -> bool:

@@ -10,12 +10,11 @@ import shutil
 import time
 from collections import deque
 from collections.abc import Callable, Collection, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from itertools import islice
 from typing import Any
 
 import torch
-from jaxtyping import UInt8
 from torch import Tensor
 
 from lang3dxl_ns.common.console import say, some, tracked
@@ -34,6 +33,7 @@ from lang3dxl_ns.preparation.model_files import (
     find_model,
     read_config,
 )
+from lang3dxl_ns.preparation.photo_cache import PhotoCache
 from lang3dxl_ns.preparation.pyramid import Crops, choose_crops
 from lang3dxl_ns.preparation.regions import RegionSource
 from lang3dxl_ns.preparation.settings import PreparationConfig, Quality
@@ -146,23 +146,6 @@ def _plan(
     return tasks, left_out
 
 
-class _ReadAhead:
-    """Reader of the tasks' photos in background threads, a few ahead of their turn."""
-
-    def __init__(self, read: Callable[[Photo], UInt8[Tensor, "h w 3"]], tasks: Sequence[_Task]) -> None:
-        self._read, self._waiting = read, deque(task.photo for task in tasks)
-        self._pool = ThreadPoolExecutor(_READERS, thread_name_prefix="photo-reader")
-        self._ahead: dict[str, Future[UInt8[Tensor, "h w 3"]]] = {}
-
-    def get(self, photo: Photo) -> UInt8[Tensor, "h w 3"]:
-        """Return the photo's pixels. Raises UserError if it cannot be read."""
-        while self._waiting and len(self._ahead) <= _READERS:
-            ahead = self._waiting.popleft()
-            self._ahead[ahead.name] = self._pool.submit(self._read, ahead)
-        future = self._ahead.pop(photo.name, None)
-        return self._read(photo) if future is None else future.result()
-
-
 class _Maker:
     """Setup of a worker that makes entries."""
 
@@ -187,11 +170,14 @@ class _Maker:
     def start(self, device: str) -> Callable[[_Task], str | None]:
         """Start a worker, as a `workers.Start`. The work returns why a photo cannot be read, or None."""
         networks = self.networks(device)
-        photos = _ReadAhead(WorkingPhotos(self._store).read, self._tasks)
+        photos, waiting = WorkingPhotos(self._store), deque(task.photo for task in self._tasks)
+        ahead = PhotoCache(lambda photo: {"image": photos.read(photo)}, 0, _READERS, patient=False)
 
         def work(task: _Task) -> str | None:
+            if waiting:
+                waiting.popleft()
             try:
-                pixels = photos.get(task.photo)
+                pixels = ahead.get(task.photo, list(islice(waiting, _READERS)))["image"]
             except UserError as error:
                 return str(error)
             image = pixels.to(device).float() / 255  # as bytes, a quarter of the data is copied to a GPU

@@ -205,6 +205,8 @@ def test_settings_that_attaching_does_not_read_and_impossible_words_are_told_bef
     for config in (replace(SETTINGS, crops="pyramid"), replace(SETTINGS, regions="felzenszwalb")):
         with pytest.raises(UserError, match="leave --crops and --regions off"):
             config.check()
+    with pytest.raises(UserError, match="leave --clip none off"):
+        attach(tmp_path / "a.ply", tmp_path, tmp_path / "a.scene", replace(SETTINGS, clip="none"))
     config = replace(SETTINGS, segment=[" ; "])
     with pytest.raises(UserError, match="the prompt is empty"):
         attach(tmp_path / "a.ply", tmp_path, tmp_path / "a.scene", config)
