@@ -131,11 +131,10 @@ class Page:
     def files(self) -> dict[str, bytes]:
         """Build the content of every file, by name."""
         self.left_out = []
-        about = dict[str, Any]()
-        files = {path.name: path.read_bytes() for path in _FILES}
+        about, files = dict[str, Any](), {path.name: path.read_bytes() for path in _FILES}
         files["language.js"] = language_module()
         files["spark.bin"] = gzip.compress(_LIBRARY.read_bytes(), mtime=0)
-        parts = self._whole, self._details, self._photos, self._lightings, self._meanings, self._views
+        parts = self._whole, self._details, self._photos, self._lightings, self._answers
         for told, made in (part() for part in parts):
             about |= told
             files |= made
@@ -210,8 +209,9 @@ class Page:
         files = {file: self.colors(name) for name, file in names.items()}
         return {"floaters": "floaters.bin", "looks": names}, files | {"floaters.bin": self.floaters()}
 
-    def _meanings(self) -> _Part:
-        """Pack what Gaussians mean, and the words that the page knows and offers."""
+    def _answers(self) -> _Part:
+        """Pack what a page is asked with: what Gaussians mean, words that it knows and offers, and views that
+        it flies to."""
         scene, meaning = self.scene, self._meaning
         if meaning is None:
             return {"words": None, "names": [], "suggested": []}, {}
@@ -225,28 +225,24 @@ class Page:
             "foreign": scene.foreignness,
             "pixels": [pack.LEAST_PIXELS, pack.PIXEL_STEPS],
         }
-        named = _distinct([*(word.name for word in scene.words.values()), *self.words, *self.more])
+        seen, named = scene.visible, [*(word.name for word in scene.words.values()), *self.words, *self.more]
+        packed = {name: pack.view_bytes(view, len(scene.splats)) for name, view in seen.items()}
+        views = self._within_limits("views", list(packed), list(map(len, packed.values())))
         about = {
             "words": meaning.description | rules,
             "foreground": _phrases(self._foreground),
-            "names": [name for name in named if phrases_of(name) != [(name, [])]],
+            "names": [name for name in _distinct(named) if phrases_of(name) != [(name, [])]],
             "suggested": self._suggested(),
+            "views": [
+                {"name": n, "bytes": len(packed[n]), **pack.camera_json(seen[n].camera)} for n in views
+            ],
         }
         files = meaning.files | self._vocabulary(meaning)
+        files["views.bin"] = b"".join(packed[name] for name in views)
         if self._foreground:
             within = scene.ask(self._foreground, foreground="").gaussians.any(0)
             files["foreground.bin"] = within.byte().cpu().numpy().tobytes()
         return about, files
-
-    def _views(self) -> _Part:
-        """Pack the views that the page flies to, if it can be asked."""
-        if self._meaning is None:
-            return {}, {}
-        seen, count = self.scene.visible, len(self.scene.splats)
-        packed = {name: pack.view_bytes(view, count) for name, view in seen.items()}
-        names = self._within_limits("views", list(packed), list(map(len, packed.values())))
-        views = [{"name": n, "bytes": len(packed[n]), **pack.camera_json(seen[n].camera)} for n in names]
-        return {"views": views}, {"views.bin": b"".join(packed[name] for name in names)}
 
     def _suggested(self) -> list[str]:
         """List words that the scene answers surely, each with matches of its own: taught ones come first."""
