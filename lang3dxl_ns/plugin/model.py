@@ -177,10 +177,8 @@ class Lang3DXLModel(SplatfactoModel):
         """Return a rendering with the channels `asked`, and the outputs of nerfstudio's viewer."""
         named = {name: part for name, part in (("asked", asked), ("colors", colors)) if part is not None}
         rendering = self.seen(camera, torch.cat(list(named.values()), dim=1) if named else None)
-        maps = dict[str, Tensor]()
-        if rendering.channels is not None:
-            widths = [part.shape[1] for part in named.values()]
-            maps = dict(zip(named, rendering.channels.split(widths, dim=2), strict=True))
+        widths, values = [part.shape[1] for part in named.values()], rendering.channels
+        maps = {} if values is None else dict(zip(named, values.split(widths, dim=2), strict=True))
         background, depth = self._get_background_color().expand_as(rendering.rgb), rendering.depth
         outputs = {
             "rgb": rendering.rgb,
