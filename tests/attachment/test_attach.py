@@ -12,8 +12,9 @@ from scenes import write_scene
 
 from lang3dxl_ns.attachment import AttachConfig
 from lang3dxl_ns.attachment.attach import attach
+from lang3dxl_ns.attachment.frames import camera_in
 from lang3dxl_ns.attachment.known_frames import known_frames
-from lang3dxl_ns.attachment.learn import photos_of, settled
+from lang3dxl_ns.attachment.learn import photos_of, scene_file, settled
 from lang3dxl_ns.commands.attach import Attach, _show
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.components.field_settings import CompressionConfig
@@ -221,3 +222,22 @@ def test_large_photos_are_prepared_at_the_requested_size(tmp_path):
     assert list(data.photos) == capture.names
     assert {(photo.width, photo.height) for photo in data.photos.values()} == {(120, 90)}
     assert targets.clip(targets.names[0]).features.shape[0] < targets.clip(targets.names[0]).features.shape[1]
+
+
+def test_a_damaged_photo_is_left_out_of_the_scene_and_others_are_listed_as_they_are_gathered(
+    tmp_path, monkeypatch
+):
+    write_scene(tmp_path / "photos", size=(120, 90), photos=3, points=200)
+    capture = open_capture(tmp_path / "photos")
+    damaged, *others = capture.photos
+    damaged.path.write_bytes(damaged.path.read_bytes()[:900])
+    monkeypatch.setattr("lang3dxl_ns.attachment.learn.LONGER_SIDE", 80)
+    whole = np.diag([2.0, 2.0, 2.0, 1.0])
+    data = photos_of(capture, whole, settled(SETTINGS), tmp_path / "cache", "cpu")
+    record = scene_file(data)
+    assert [photo.name for photo in record.photos] == [photo.name for photo in others]
+    assert {(photo.camera.width, photo.camera.height) for photo in record.photos} == {(80, 60)}
+    assert {photo.split for photo in record.photos} == {"train"} and record.scale == 2
+    for photo in record.photos:
+        expected = camera_in(whole, capture.reconstruction.photos[photo.name])
+        torch.testing.assert_close(photo.camera.view_matrix, expected.view_matrix, atol=1e-5, rtol=0)

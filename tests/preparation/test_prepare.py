@@ -8,6 +8,7 @@ import math
 import os
 import re
 import shutil
+import threading
 import time
 from dataclasses import replace
 from types import SimpleNamespace
@@ -31,6 +32,7 @@ from lang3dxl_ns.preparation.pyramid import build_clip_target
 from lang3dxl_ns.preparation.regions import FelzenszwalbRegions, FolderRegions, stored_labels
 from lang3dxl_ns.preparation.settings import PreparationConfig
 from lang3dxl_ns.preparation.store import FeatureStore
+from lang3dxl_ns.preparation.working_photos import WorkingPhotos
 from lang3dxl_ns.scene.camera import Lens
 from lang3dxl_ns.scene.photo import Photo
 
@@ -194,6 +196,17 @@ def test_changed_scales_make_only_the_photos_whose_crops_change(photos, config, 
     calls.clear()
     run(photos, config, store, [2.0, 3.0], sizes)
     assert calls == {"clip": 2, "read": 2, "clip loaded": 1}
+
+
+def test_the_next_photos_are_read_while_one_is_encoded(photos, config, store, monkeypatch):
+    together, read = threading.Barrier(2, timeout=60), WorkingPhotos.read
+
+    def reading(self, photo, scale=1.0):
+        together.wait()
+        return read(self, photo, scale)
+
+    monkeypatch.setattr(WorkingPhotos, "read", reading)
+    assert prepare(photos[:2], None, config, SCALES, store, "cpu").names == NAMES[:2]
 
 
 def test_a_damaged_entry_is_made_again_alone(photos, config, store, calls):
