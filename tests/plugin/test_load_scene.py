@@ -276,6 +276,17 @@ def test_a_run_of_a_version_with_a_setting_that_has_gone_can_be_asked(trainer, t
     assert lang3dxl_ns.load_scene(config).query("dome").relevancy.any()
 
 
+def test_a_run_of_a_version_whose_settings_were_in_other_modules_can_be_asked(trainer, tmp_path):
+    shutil.copytree(trainer.base_dir, tmp_path / "run")
+    config = tmp_path / "run" / "config.yml"
+    text = config.read_text()
+    for module, name in (("semantic_field", "SemanticFieldConfig"), ("compression", "CompressionConfig")):
+        text, count = re.subn(rf"components\.field_settings\.{name}", f"components.{module}.{name}", text)
+        assert count
+    config.write_text(text)
+    assert lang3dxl_ns.load_scene(config).query("dome").relevancy.any()
+
+
 def test_a_run_that_trains_on_all_photos_leaves_a_scene_that_opens(train, scene_photos):
     """The same photos are held out, then; the file lists each once."""
     trained = train(scene_photos, iterations=2, pipeline__datamanager__dataparser__eval_mode="all")
