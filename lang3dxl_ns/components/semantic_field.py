@@ -15,7 +15,6 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from lang3dxl_ns.components.feature_decoder import Decoder, Features
-from lang3dxl_ns.components.field_settings import Preset as Preset
 from lang3dxl_ns.components.field_settings import SemanticFieldConfig
 from lang3dxl_ns.components.hash_grid import COORDINATE_LIMIT, HashGrid
 from lang3dxl_ns.components.linear import linear

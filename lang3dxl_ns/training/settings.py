@@ -13,7 +13,7 @@ from lang3dxl_ns.components.appearance import AppearanceConfig
 from lang3dxl_ns.components.decoders import DecoderConfig
 from lang3dxl_ns.components.downsampler import DownsamplerConfig
 from lang3dxl_ns.components.feature_decoder import LearningDecoder
-from lang3dxl_ns.components.semantic_field import Preset, SemanticFieldConfig
+from lang3dxl_ns.components.field_settings import Preset, SemanticFieldConfig
 from lang3dxl_ns.preparation.settings import PreparationConfig
 from lang3dxl_ns.training.learning_rates import log_linear, run_length_weight
 from lang3dxl_ns.training.scene_settings import PRINTED_LOOKS, SceneSettings, plain_as_printed
