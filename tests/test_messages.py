@@ -14,7 +14,7 @@ from PIL import Image
 from lang3dxl_ns.cli import main
 from lang3dxl_ns.common.device import known_device
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.common.options import data_option, model_option
+from lang3dxl_ns.common.options import data_option, model_option, switched_on
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth
 from lang3dxl_ns.query.match import together
 from lang3dxl_ns.query.text import Prompt, parse_prompts
@@ -210,9 +210,13 @@ def test_a_device_that_is_not_there_is_told(device, tmp_path):
         ("/usr/bin/ns-train", "--pipeline.datamanager.clip", "--pipeline.model.max-gaussians"),
         ("/x/nerfstudio/scripts/train.py", "--pipeline.datamanager.clip", "--pipeline.model.max-gaussians"),
         ("/usr/bin/lang3dxl", "--clip", "--max-gaussians"),
+        ("/home/a/nerfstudio/.venv/bin/lang3dxl", "--clip", "--max-gaussians"),
         ("", "--clip", "--max-gaussians"),
     ],
 )
 def test_messages_spell_options_as_the_command_that_runs_has_them(command, clip, gaussians, monkeypatch):
     monkeypatch.setattr("sys.argv", [command])
     assert data_option("clip") == clip and model_option("max-gaussians") == gaussians
+    theirs = clip != "--clip"
+    assert model_option("appearance.use") == ("--pipeline.model.appearance.use" if theirs else "--looks")
+    assert switched_on("--random-init") == ("--random-init True" if theirs else "--random-init")

@@ -6,6 +6,8 @@ import sys
 from pathlib import Path
 
 _DATA, _MODEL = "--pipeline.datamanager.", "--pipeline.model."
+OWN_NAMES = {"appearance.use": "looks"}
+"""Settings that our own commands call otherwise."""
 
 
 def data_option(name: str) -> str:
@@ -16,10 +18,15 @@ def data_option(name: str) -> str:
 
 def model_option(name: str) -> str:
     """Spell an option of the model, such as `max-gaussians` (see `data_option`)."""
-    return f"{_MODEL if _in_nerfstudio() else '--'}{name}"
+    return f"{_MODEL}{name}" if _in_nerfstudio() else f"--{OWN_NAMES.get(name, name)}"
+
+
+def switched_on(option: str) -> str:
+    """Spell an option, as `data_option` and `model_option` return it, that is switched on."""
+    return f"{option} True" if _in_nerfstudio() else option
 
 
 def _in_nerfstudio() -> bool:
     """Return whether one of nerfstudio's commands runs, by its name or as `python -m nerfstudio.…`."""
     command = Path(sys.argv[0] if sys.argv else "")
-    return command.name.startswith("ns-") or "nerfstudio" in command.parts
+    return command.name.startswith("ns-") or "nerfstudio/scripts/" in command.as_posix()

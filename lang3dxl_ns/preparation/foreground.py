@@ -18,7 +18,7 @@ import torch
 
 from lang3dxl_ns.common.console import some, tracked
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.common.options import data_option
+from lang3dxl_ns.common.options import data_option, switched_on
 from lang3dxl_ns.common.pictures import NoPictureError, mask_values, open_picture
 from lang3dxl_ns.preparation.segmentation import find_text_segmenter, load_text_segmenter
 from lang3dxl_ns.preparation.settings import PreparationConfig
@@ -94,7 +94,7 @@ def _checked(photos: list[Photo], skip: bool, log: Log) -> list[Photo]:
     if damaged and not skip:
         raise UserError(
             f"{len(damaged)} masks can't be read: {'; '.join(damaged.values())}. Replace or remove them, or "
-            f"let these photos count whole: {data_option('skip-damaged-masks')} True"
+            f"let these photos count whole: {switched_on(data_option('skip-damaged-masks'))}"
         )
     if damaged:
         log(f"{len(damaged)} masks can't be read, and their photos count whole: {some(list(damaged))}")

@@ -101,8 +101,8 @@ class FeatureStore:
         with _opened(path, f"{kind} of {name}") as file:
             if settings is not None and file.metadata()["settings"] != _canonical(settings):
                 raise PhotosGoneError(
-                    f"{path} was meanwhile made with other settings, by another command: repeat this one (a "
-                    "run goes on with --load-dir), and give the other a {data_option('cache-dir')} of its own"
+                    f"{path} was overwritten by another command with different settings: repeat this one, "
+                    f"and give the other a {data_option('cache-dir')} of its own"
                 )
             return {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 (not a dict)
 

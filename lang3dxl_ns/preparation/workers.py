@@ -18,6 +18,7 @@ import torch
 
 from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.options import data_option
 from lang3dxl_ns.preparation.settings import PreparationConfig
 
 PATIENCE_S = 30.0
@@ -60,7 +61,7 @@ def _run_in_processes(count: int, start: Start[Item, Result], items: Sequence[It
     except BrokenProcessPool as error:
         raise UserError(
             f"one of the {count} processes died, perhaps because memory ran out: what they have made is "
-            "kept; run the same command again, with fewer --workers"
+            f"kept; run the same command again, with fewer {data_option('workers')}"
         ) from error
     finally:
         pool.shutdown(wait=False, cancel_futures=True)
@@ -107,7 +108,7 @@ def _run_on_ray(config: PreparationConfig, start: Start[Item, Result], items: Se
         import ray
         from ray.util import ActorPool
     except ImportError as error:
-        raise UserError("--engine ray needs Ray: pip install -e '.[ray]'") from error
+        raise UserError("the engine ray needs a package: pip install -e '.[ray]'") from error
     started = not ray.is_initialized()
     if started:
         _connect(ray, config)
@@ -149,6 +150,6 @@ def _connect(ray: Any, config: PreparationConfig) -> None:
             ray.shutdown()  # of what it has started
         reason = error if answer.done() else f"no answer within {PATIENCE_S:.0f} s"
         raise UserError(
-            f"no Ray cluster answers at {config.address or 'this machine'} ({reason}): give --address, or "
-            "start one with `ray start --head`"
+            f"no Ray cluster answers at {config.address or 'this machine'} ({reason}): give "
+            f"{data_option('address')}, or start one with `ray start --head`"
         ) from error

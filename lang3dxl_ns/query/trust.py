@@ -44,7 +44,7 @@ _TYPICAL = 5.3
 """Median distance of scenes of generated landmarks, so that their foreignness is about 1."""
 _SAMPLE = 4096
 _TEACH = "outline it in a photo (lang3dxl teach)"
-_LARGER = "train with a larger CLIP (--clip openai/clip-vit-base-patch32)"
+_LARGER = "train with a larger CLIP, such as openai/clip-vit-base-patch32"
 
 
 @dataclass(frozen=True)

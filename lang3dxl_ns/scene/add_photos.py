@@ -139,7 +139,7 @@ def _photos_of(data: Path, place: Path) -> tuple[Path, list[str]]:
     """Return the folder of a model's photos, and their names. Raises UserError if the model or its photos are
     missing, or can't be written."""
     if not has_model(place):
-        raise UserError(f"{data} has no COLMAP model to add to: reconstruct it first, without --add")
+        raise UserError(f"{data} has no COLMAP model to add photos to: reconstruct its own photos first")
     images = images_folder(data, place)
     old = [name for name in read_reconstruction(place).photos if inside(images, name).is_file()]
     if not old:

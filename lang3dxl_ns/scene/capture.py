@@ -94,8 +94,8 @@ class Capture:
         for part, names in (("train", train), ("held-out", held_out)):
             if not names:
                 raise UserError(
-                    f"the {part} split of {self.folder} has no photo (of {len(self.photos)} in all): add "
-                    "photos, or choose another split with `lang3dxl-colmap --eval-mode …` after all options"
+                    f"the {part} split of {self.folder} has none of the {len(self.photos)} photos: add "
+                    f"photos, or correct the lists there ({', '.join(_SPLIT_LISTS)})"
                 )
         return Split(train, held_out)
 
@@ -197,8 +197,8 @@ def open_capture(
         first = next(iter(capture.left_out.items()), ("", "it lists none"))
         raise UserError(
             f"none of the {len(capture.left_out)} photos of {folder} can be used; the first: "
-            f"{': '.join(first)}. Name the photos' folder with `lang3dxl-colmap --images-path FOLDER` after "
-            "the other options"
+            f"{': '.join(first)}. Put the photos into images/ there, or tell ns-train their folder with "
+            "`lang3dxl-colmap --images-path FOLDER` after all other options"
         )
     return _without_lost_cameras(capture)
 
@@ -214,7 +214,7 @@ def find_source(
     if folder.suffix == ".json" and folder.is_file():
         return folder.parent, folder
     if not folder.is_dir():
-        raise UserError(f"{folder} is not a folder: pass the one that holds your photos as --data")
+        raise UserError(f"{folder} is not a folder: give the folder with your photos, or a video")
     if settings.colmap_path is not None:
         return folder, folder / settings.colmap_path
     if (whole := whole_scene(folder)) != folder:
@@ -305,8 +305,7 @@ def _mention_what_is_not_used(capture: Capture, model: Path, listed: set[str]) -
         ]
         say(
             f"{capture.folder} has {len(counted)} models; used is {counted[0]} photos. There are also "
-            f"{', '.join(counted[1:])}: choose with `lang3dxl-colmap --colmap-path FOLDER` after all other "
-            "options"
+            f"{', '.join(counted[1:])}: to use one of them, give its folder instead of the scene's"
         )
     unknown = [name for name in photos_below(capture.images) if name not in listed]
     if unknown:

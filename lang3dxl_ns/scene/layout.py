@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shlex
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -97,4 +96,4 @@ def mention_other_cameras(folder: Path) -> None:
     for path in folder.glob("*.json"):
         with suppress(*DAMAGE):
             if '"transform_matrix"' in read_text(path):
-                say(f"{path} holds cameras, too: to use them, give --data {shlex.quote(str(path))}")
+                say(f"{path} holds cameras, too: to use them, give this file instead of its folder")

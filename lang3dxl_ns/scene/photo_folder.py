@@ -63,7 +63,7 @@ def check_data(data: Path | None) -> None:
     place = Path() if data is None else expanded(data)
     known = is_video(place) or (place.is_file() and place.suffix == ".json")
     if not (known or place.is_dir() or frames_folder(place).is_dir()):
-        raise UserError(f"{data} is not a folder: pass the one that holds your photos as --data, or a video")
+        raise UserError(f"{data} is not a folder: give the folder with your photos, or a video")
 
 
 def shared_cameras(photos: PhotoFolder) -> list[list[str]]:

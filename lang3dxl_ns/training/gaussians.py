@@ -17,7 +17,7 @@ from torch.nn import Parameter
 
 from lang3dxl_ns.common.device import to_device
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.common.options import model_option
+from lang3dxl_ns.common.options import model_option, switched_on
 from lang3dxl_ns.rendering import Gaussians, harmonics_of
 from lang3dxl_ns.rendering.gaussians import MAX_LOG_SCALE
 from lang3dxl_ns.rendering.spherical_harmonics import spherical_harmonics
@@ -53,8 +53,7 @@ def seed_positions(
     if len(points[0]) < FEWEST:
         raise UserError(
             f"the scene has {len(points[0])} 3D points, too few to start from: reconstruct it again (colmap "
-            "point_triangulator), or start from random Gaussians: "
-            f"{model_option('random-init')} True"
+            f"point_triangulator), or start from random Gaussians: {switched_on(model_option('random-init'))}"
         )
     return points[0].float(), points[1].float() / 255
 

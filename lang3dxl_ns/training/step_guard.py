@@ -57,8 +57,7 @@ class StepGuard:
             raise UserError(
                 f"{self._in_a_row} steps in a row had no finite loss or gradient (the last, step {step}, "
                 f"photo {photo}: {what}). The parameters are intact: check the photos "
-                f"named above, their masks and targets, lower the learning rate of the parameters named "
-                f"here, or allow more with --max-skipped-steps"
+                "named above, their masks and targets, or lower the learning rate of these parameters"
             )
         return False
 

@@ -182,10 +182,11 @@ def change_points(folder, xyz):
 
 
 @pytest.mark.parametrize("xyz", [None, [np.nan] * 3, [np.inf, 0, 0], [1e300] * 3])
-def test_training_without_usable_points_says_so(folder, xyz, tiny_clip, tiny_dense, tmp_path):
+def test_training_without_usable_points_says_so(folder, xyz, tiny_clip, tiny_dense, tmp_path, monkeypatch):
+    monkeypatch.setattr("sys.argv", ["ns-train"])
     change_points(folder, xyz)
     trainer = make_trainer(folder, tiny_clip, tiny_dense, tmp_path / "out", 2, semantics=False)
-    with pytest.raises(UserError, match=r"has 0 3D points.*--random-init True"):
+    with pytest.raises(UserError, match=r"has 0 3D points.*--pipeline.model.random-init True"):
         trainer.setup()
 
 
@@ -330,7 +331,7 @@ def masked(photos, folder, **options):
 
 def test_damaged_masks_are_named_all_at_once_and_left_out_where_asked(folder):
     photos = masks(folder, [None, 255, None, 255])
-    with pytest.raises(UserError, match=r"2 masks can't be read: .*photo_000\.png .*photo_002\.png .*True"):
+    with pytest.raises(UserError, match=r"2 masks can't be read: .*photo_000\.png .*photo_002\.png .*--skip-damaged-masks"):
         masked(photos, folder)
     names, said = masked(photos, folder, skip_damaged_masks=True)
     assert names == {"photo_001.jpg", "photo_003.jpg"}

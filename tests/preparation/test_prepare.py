@@ -509,7 +509,7 @@ def test_targets_that_another_command_makes_otherwise_meanwhile_are_refused(stor
     read = {"clip": lambda: reader.clip("a").features, "dense": lambda: reader.dense("a")}[kind]
     assert (read() == 1).all()
     write(2.0, {**settings, "encoder": "second"})
-    with pytest.raises(UserError, match=r"meanwhile made with other settings.*cache-dir"):
+    with pytest.raises(UserError, match=r"overwritten by another command.* a --cache-dir of its own"):
         read()
     write(1.0, settings)
     assert (read() == 1).all()

@@ -263,7 +263,7 @@ def test_a_stopped_addition_goes_on_with_what_it_has(scene, monkeypatch):
 
 def test_without_a_model_the_way_to_one_is_told(scene):
     shutil.rmtree(scene / "data/sparse")
-    with pytest.raises(UserError, match="reconstruct it first, without --add"):
+    with pytest.raises(UserError, match="reconstruct its own photos first"):
         add_photos(scene / "data", scene / "late", None, SIFT)
 
 
