@@ -331,7 +331,9 @@ def masked(photos, folder, **options):
 
 def test_damaged_masks_are_named_all_at_once_and_left_out_where_asked(folder):
     photos = masks(folder, [None, 255, None, 255])
-    with pytest.raises(UserError, match=r"2 masks can't be read: .*photo_000\.png .*photo_002\.png .*--skip-damaged-masks"):
+    with pytest.raises(
+        UserError, match=r"2 masks can't be read: .*photo_000\.png .*photo_002\.png .*--skip-damaged-masks"
+    ):
         masked(photos, folder)
     names, said = masked(photos, folder, skip_damaged_masks=True)
     assert names == {"photo_001.jpg", "photo_003.jpg"}
