@@ -56,7 +56,7 @@ COMMANDS = {
     "export": ("commands.export:Export", "Write a scene, or what matches a text, as a splat or a web page."),
     "teach": ("commands.teach:Teach", "Show a scene what a word means, by marking it in a photo."),
     "words": ("commands.teach:Words", "List, forget, save and load the words that a scene was taught."),
-    "info": ("commands.view:Info", "Tell what a scene file holds, and where it comes from."),
+    "info": ("commands.view:Info", "Show a scene file's contents and origin."),
     "view": ("commands.view:View", "Explore and query a trained scene in the viewer."),
     "demo-scene": ("lab.landmark.demo_scene:DemoScene", "Generate photos of a procedural landmark."),
     "evaluate": ("commands.evaluate:Evaluate", "Score words against ground truth."),

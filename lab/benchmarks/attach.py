@@ -48,7 +48,7 @@ class AttachBenchmark:
         files = [find_scene_file(path) or path for path in self.scenes]
         first = read_scene(files[0])
         if first.file.clip is None:
-            raise UserError(f"{self.scenes[0]} has colors alone: name a scene with words")
+            raise UserError(f"{self.scenes[0]} has only colors: name a scene with words")
         files += attached(first, self.data, self.out) if len(files) == 1 else []
         scenes = {path: read_scene(path) for path in files}
         truth, views = _labeled(self.data, first)

@@ -89,7 +89,7 @@ def solids(splats: Splats) -> Splats:
     """Select the opaque Gaussians, at most 200,000 of them. Raises UserError if there are hardly any."""
     rows = (splats.opacities > _OPAQUE).nonzero()[:, 0]
     if len(rows) < 10:
-        raise UserError("this splat has hardly an opaque Gaussian: nothing can be seen in it")
+        raise UserError("hardly any Gaussian of this splat is opaque: nothing can be seen in it")
     return splats.select(rows[:: -(-len(rows) // 200_000)])
 
 
@@ -103,7 +103,7 @@ def _found_up(solid: Splats, center: Float[Tensor, "3"], radius: float) -> Float
         say(f"up is about {name}, by a margin of {found.margin:.1f}; --up sets another direction")
     else:
         say(
-            f"which way is up is doubtful: {name} leads {other} by only {found.margin:.1f}. If the views "
+            f"the up direction is uncertain: {name} leads {other} by only {found.margin:.1f}. If the views "
             f"aren't upright, set --up={numbers[1]}"
         )
     return found.direction

@@ -79,7 +79,9 @@ class Export(OfScene):
             make_folder(self.out.parent)
             check_splat_name(self.out)
             if len(prompts) > 1:
-                raise UserError("a splat file is of one --text: write several files, or a page (--web)")
+                raise UserError(
+                    "a splat file holds the matches of one --text: write several files, or a page (--web)"
+                )
         scene = load_scene(self.scene, settings=self.settings, clip=self.clip)
         write = {"out": self._splat, "web": self._page, "scene_file": self._scene, "video": self._video}
         prompts = parse_texts(self.text, self.not_, scene.words)
@@ -132,7 +134,7 @@ class Export(OfScene):
         try:
             return whole_words(name)
         except UserError as error:
-            say(f"The page knows the shipped words alone: {error}")
+            say(f"The page knows only the shipped words: {error}")
             return ()
 
     def _told(self) -> Provenance:

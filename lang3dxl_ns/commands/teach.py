@@ -56,7 +56,7 @@ class Teach(OfScene):
             taught = scene.teach(self.word, [*before, example])
             keep_words(file, {name: taught.words[name]})
         say(*described(taught.words[name]))
-        say(f"  least sure in {taught.unsure(self.word)}: check it, and mark it next")
+        say(f"  most uncertain in {taught.unsure(self.word)}: check it, and mark it there next")
 
     def _example(self) -> Example:
         from lang3dxl_ns.evaluation.layouts import read_gray
@@ -120,7 +120,7 @@ class Words(OfScene):
                 raise UserError("there is no word to save: teach one with lang3dxl teach")
             save_words(self.save, words)
         if not words:
-            say("This scene was taught no word: lang3dxl teach --word doors --photo NAME --at X,Y")
+            say("This scene was taught no words yet: lang3dxl teach --word doors --photo NAME --at X,Y")
         for word in words:
             say(*described(word))
 

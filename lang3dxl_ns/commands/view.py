@@ -83,7 +83,7 @@ class Info:
 
         told = describe_scene_file(existing_scene_file(self.scene))
         decoder, count = told["decoder"], told["gaussians"]
-        words = "none: colors alone" if decoder is None else f"CLIP {told['clip']}, decoder {decoder['name']}"
+        words = "none, only colors" if decoder is None else f"CLIP {told['clip']}, decoder {decoder['name']}"
         lines = {name.replace("_", " "): value for name, value in vars(told["provenance"]).items()} | {
             "Gaussians": f"{count:,}",
             "photos": f"{told['photos']}{', each with its lighting' if told['looks'] else ''}",

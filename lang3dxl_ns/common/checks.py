@@ -55,7 +55,7 @@ def check_address(host: str, port: int | None) -> None:
         if getattr(error, "errno", None) == errno.EADDRINUSE:
             raise UserError(f"port {port} is taken by another program: name another, or none") from error
         raise UserError(
-            f"{host} is no address of this machine ({in_a_line(error)}): use 127.0.0.1, or 0.0.0.0 for all"
+            f"{host} is not an address of this machine ({in_a_line(error)}): use 127.0.0.1, or 0.0.0.0"
         ) from error
 
 

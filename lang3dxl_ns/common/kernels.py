@@ -38,6 +38,6 @@ def numba_works() -> bool:
         jit.successor(0)
     except Exception as error:  # of any kind, depending on the mismatch
         if not (isinstance(error, ModuleNotFoundError) and error.name == "numba"):
-            say(f"numba does not work ({in_a_line(error)}): torch takes its place, at 2 to 4 times the time")
+            say(f"numba does not work ({in_a_line(error)}): torch takes its place, 2 to 4 times slower")
         return False
     return True

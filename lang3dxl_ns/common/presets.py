@@ -41,7 +41,7 @@ def train_flags(name: str) -> list[str]:
     release does differently. Raises UserError for another name."""
     choices = [OFFICIAL, *scene_presets()]
     if name not in choices:
-        raise UserError(f"{name!r} is no preset for training: choose one of {', '.join(choices)}")
+        raise UserError(f"{name!r} is not a preset for training: choose one of {', '.join(choices)}")
     settings = load_preset(name)
     scale = {"pipeline.datamanager.scale-preset": name} if "scale_range" in settings else {}
     flags = scale | settings["train"]

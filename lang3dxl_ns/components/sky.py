@@ -1,6 +1,6 @@
 """Sky: opaque Gaussians on a sphere around the scene, with colors that are one smooth function.
 
-Colors learned one by one are mottled after a run of minutes, since each photo shows only a few of them. Where
+Colors learned one by one are blotchy after short runs, since each photo shows only a few of them. Where
 no photo looked, they stay gray.
 """
 

@@ -50,7 +50,7 @@ def read_checkpoint(path: Path) -> Splats:
         return _splatfacto(parts["pipeline"], path)
     if isinstance(parts.get("splats"), dict):
         return _gsplat(parts["splats"], path)
-    raise UserError("it is a checkpoint of another program than gsplat and nerfstudio")
+    raise UserError("it is a checkpoint of a program other than gsplat and nerfstudio")
 
 
 def _gsplat(parts: Mapping[str, Any], path: Path) -> Splats:

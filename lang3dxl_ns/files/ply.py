@@ -75,7 +75,7 @@ def _supersplat(path: Path, tables: dict[str, Table]) -> Splats:
     import gsply
 
     if "min_r" not in [name for name, _ in tables["chunk"].columns]:
-        raise UserError("an older SuperSplat wrote it: open it in the present one, and save it again")
+        raise UserError("an older SuperSplat wrote it: open it in the current one, and save it again")
     count, chunks = tables["vertex"].length, tables["chunk"].length
     expect(chunks == -(-count // 256), f"{count:,} Gaussians don't lie in {chunks:,} chunks")
     expect("sh" not in tables or tables["sh"].length == count, "its harmonics are of other Gaussians")

@@ -60,7 +60,7 @@ def read_splats(path: str | Path) -> Splats:
     reader = _READERS.get(path.suffix.lower())
     if reader is None:
         raise UserError(
-            f"{path.name} is of no kind that can be read: give {KINDS}; SuperSplat makes a .ply of others"
+            f"{path.name} has an unsupported format: give {KINDS}; SuperSplat makes a .ply of others"
         )
     try:
         # gsplat on several GPUs leaves a file of each (ckpt_6999_rank1.pt).

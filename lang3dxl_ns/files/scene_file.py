@@ -85,7 +85,7 @@ class Provenance:
 def check_scene_name(path: Path) -> None:
     """Raise UserError if the name ends in none of .scene, .glb and .spz."""
     if path.suffix != SUFFIX and path.suffix not in _CARRIERS:
-        raise UserError(f"{path.name} doesn't name a scene: end it in {SUFFIX}, {' or '.join(_CARRIERS)}")
+        raise UserError(f"{path.name} must have the extension {SUFFIX}, {' or '.join(_CARRIERS)}")
 
 
 def write_scene(path: Path, scene: Scene, provenance: Provenance | None = None) -> int:
@@ -217,7 +217,7 @@ def _with_words_of(scene: Scene, earlier: Path, replaced: Path) -> Scene:
     try:
         words = describe_scene_file(earlier)["taught"]
     except UserError as error:
-        say(f"Words taught in {earlier.name} are not taken over: {error}")
+        say(f"Words taught in {earlier.name} are not carried over: {error}")
         return scene
     for word in words:
         name, new = known_word(word.name), scene.words.get(known_word(word.name))

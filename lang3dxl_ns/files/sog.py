@@ -100,7 +100,7 @@ def read_sog(path: Path) -> Splats:
     with zipfile.ZipFile(path) as bundle:
         about: dict[str, Any] = json.loads(_member(bundle, "meta.json"))
         if about.get("version") != 2:
-            raise UserError("it is SOG of another version than 2: convert it with splat-transform")
+            raise UserError("its SOG version is not 2: convert it with splat-transform")
         count = about["count"]
         expect(isinstance(count, int) and count >= 0, "its number of Gaussians")
         check_memory(count, ALL_BANDS)

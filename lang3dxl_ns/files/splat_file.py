@@ -79,7 +79,7 @@ def write_index(path: Path, selected: Bool[Tensor, " n"]) -> None:
     """Write the selected Gaussians' numbers, from 0, as .npy or .txt. Raises UserError for other endings."""
     writers: dict[str, Callable] = {".npy": np.save, ".txt": partial(np.savetxt, fmt="%d")}
     if (kind := path.suffix.lower()) not in writers:
-        raise UserError(f"{path.name} names no kind of list: end it in .npy or .txt")
+        raise UserError(f"{path.name} has an unsupported list format: use .npy or .txt")
     content = io.BytesIO()
     writers[kind](content, selected.nonzero()[:, 0].cpu().numpy())
     write_atomically(path, content.getvalue())
@@ -90,4 +90,4 @@ def check_splat_name(path: Path) -> None:
     if path.is_dir():
         raise UserError(f"{path} is a folder: name a {SPLAT_NAMES} file in it")
     if path.suffix.lower() not in _WRITERS:
-        raise UserError(f"{path.name} names no kind of splat file: end it in {SPLAT_NAMES}")
+        raise UserError(f"{path.name} has an unsupported splat format: use {SPLAT_NAMES}")

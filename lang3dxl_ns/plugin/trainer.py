@@ -195,7 +195,7 @@ class Lang3DXLTrainer(Trainer):
             self.pipeline.load_pipeline(state["pipeline"], state["step"])
             if left_out := sorted(set(state["optimizers"]) - set(self.optimizers.optimizers)):
                 raise UserError(
-                    f"{path} was trained with {', '.join(left_out)}, which the present settings leave out: "
+                    f"{path} was trained with {', '.join(left_out)}, which the current settings leave out: "
                     "pass the options that the run began with, or train anew"
                 )
             self.optimizers.load_optimizers(state["optimizers"])
@@ -212,7 +212,9 @@ class Lang3DXLTrainer(Trainer):
         data = self.pipeline.datamanager.data
         frame = data.capture.recorded_frame
         if not before.has_frame(frame.transform, frame.scale):
-            raise UserError(f"{path} is of other photos, or of another reconstruction of them: train anew")
+            raise UserError(
+                f"{path} belongs to other photos, or to another reconstruction of them: train anew"
+            )
         splits = [{p.name: p.split for p in file.photos} for file in (before, data.record())]
         trained = [[name for name, split in known.items() if split == "train"] for known in splits]
         if corrected and trained[0] != trained[1]:
@@ -222,8 +224,8 @@ class Lang3DXLTrainer(Trainer):
         moved = [name for name, split in splits[1].items() if splits[0].get(name, split) != split]
         if moved:
             say(
-                f"{len(moved)} photos are on the other side of training and held-out ones than when this run "
-                f"began ({some(moved)}): figures of held-out photos will be too good"
+                f"{len(moved)} photos moved between the training and held-out sets since this run began "
+                f"({some(moved)}): metrics of held-out photos will be too good"
             )
 
     def eval_iteration(self, step: int) -> None:

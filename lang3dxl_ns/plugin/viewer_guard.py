@@ -53,7 +53,7 @@ def guard_viewers() -> None:
         except websockets.exceptions.ConnectionClosed:
             raise
         except Exception as error:  # viser lets anything through, and would answer this client no more
-            say(f"a viewer was disconnected, since its message is none of the page's ({error!r:.80})")
+            say(f"a viewer was disconnected, as the page sends no such message ({error!r:.80})")
             await websocket.close(1007)
             await websocket.recv()  # raises what viser takes for the end of a connection
 

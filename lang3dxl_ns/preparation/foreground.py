@@ -102,7 +102,7 @@ def _checked(photos: list[Photo], skip: bool, log: Log) -> list[Photo]:
         most = max(dark.values())
         how = f"dark (the brightest pixel has {most} of 255)" if most else "black"
         raise UserError(
-            f"all {len(dark)} masks are {how}: nothing would count, since white (255) is what to keep. "
+            f"all {len(dark)} masks are {how}: nothing would be kept, since white (255) marks what to keep. "
             f"Draw it white, or pass {data_option('foreground')} none"
         )
     if dark:

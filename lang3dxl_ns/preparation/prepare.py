@@ -238,13 +238,12 @@ class _Maker:
         hint = "" if faster > 0.9 * takes else f"; {quality} fast: {roughly(faster)}"
         say(f"{len(counts):,} photos, {encoded:,} crops with {config.clip}: {roughly(takes)}{hint}")
         if device.type == "cpu" and takes > _LONG_S:
-            remedies = ["a GPU (some hundred times)", *([f"{quality} fast"] if hint else [])]
+            remedies = ["a GPU (about a hundred times faster)", *([f"{quality} fast"] if hint else [])]
             if config.clip != BUILTIN:
                 remedies.append(f"{data_option('clip')} builtin if its words suffice")
             say(
-                "That is long, since this runs on the CPU. What shortens it: "
-                f"{', '.join([*remedies, 'fewer photos'])}. It can be stopped at any time and goes on where "
-                "it was"
+                f"This is slow on a CPU. To speed it up: {', '.join([*remedies, 'fewer photos'])}. You can "
+                "stop it at any time; the same command resumes it"
             )
 
 

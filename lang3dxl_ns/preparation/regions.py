@@ -74,7 +74,7 @@ def region_source(config: PreparationConfig, data: Path) -> RegionSource | None:
         prompts = sorted(config.region_prompts)
         if not is_sam3(found):
             raise UserError(
-                f"regions text needs a SAM 3, and {found.words.name} is none: "
+                f"regions text needs a SAM 3, which {found.words.name} is not: "
                 f"{data_option(TEXT_OPTION)} facebook/sam3"
             )
         load = partial(_masks_of_instances, found.words, prompts)

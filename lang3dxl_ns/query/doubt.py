@@ -94,7 +94,7 @@ def doubtful(text: str, doubt: float, taught: bool = False) -> str | None:
     if taught:
         why = f"{doubt:.0%} of what was not marked as {text!r} fits as well: mark it in more photos"
     elif doubt == 1.0:
-        why = f"{text!r} fits no place: it may be absent, {unknown}"
+        why = f"{text!r} matches nothing in this scene: it may be absent, {unknown}"
     else:
         fit = f"{doubt:.0%} of unrelated words fit this scene as well as {text!r}"
         why = f"{fit}: it may not be here, {unknown}"

@@ -174,7 +174,7 @@ def save_picture(pixels: UInt8[Array, "h w *c"], path: str | Path) -> Path:
     path, content = expanded(path), io.BytesIO()
     form = Image.registered_extensions().get(path.suffix.lower())
     if form not in ("PNG", "JPEG", "WEBP", "TIFF", "BMP"):
-        raise UserError(f"{path.name} names no kind of picture: end it in .png or .jpg")
+        raise UserError(f"{path.name} has an unsupported image format: use .png or .jpg")
     Image.fromarray(pixels).save(content, form, quality=92)
     write_atomically(path, content.getvalue())
     return path

@@ -88,7 +88,7 @@ class Scene:
 
     def __repr__(self) -> str:
         held_out = sum(photo.split == "eval" for photo in self.photos)
-        words = f"CLIP {self.file.clip}" if self.decoder is not None else "colors alone"
+        words = f"CLIP {self.file.clip}" if self.decoder is not None else "only colors"
         return (
             f"Scene({len(self.splats):,} Gaussians, {len(self.photos)} photos ({held_out} held out) "
             f"of {self.file.data}, {words})"

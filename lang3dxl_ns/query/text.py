@@ -26,7 +26,7 @@ from lang3dxl_ns.words.taught_words import TaughtWord, known_word
 
 EncodeTexts = Callable[[list[str]], Float[Tensor, "n c"]]
 """Function that encodes texts, such as `ImageTextEncoder.encode_texts`."""
-NO_SEMANTICS = "this scene has colors alone (it was trained with clip none): it can't be queried"
+NO_SEMANTICS = "this scene has only colors (it was trained with clip none): it can't be queried"
 
 _SAME = 0.95
 """Cosine from which a vector and a phrase are taken to mean the same."""
@@ -108,7 +108,7 @@ def caution(text: str) -> str | None:
     """Return a warning about a prompt that names nothing, such as *the* or *42*, or that has words which CLIP
     can't tell (places, sizes, colors, an unquoted *not*); None for others."""
     if all(_NO_NAME.fullmatch(word) for word in re.findall(r"\w+", text.casefold())):
-        return f"{text} names nothing that can be seen: what follows is chance"
+        return f"{text} does not name a visible object: the results are arbitrary"
     if len(text.split()) > _MOST_WORDS:
         return f"CLIP reads about {_MOST_WORDS} words: the rest of this prompt is ignored"
     return "; ".join(meaning(text).advice) or None

@@ -150,7 +150,7 @@ def build(folder: Path, arch: str) -> Path:
         try:
             lock.acquire(timeout=0)
         except Timeout:
-            say(f"Another process builds gsplat's CUDA kernels in {folder}: waiting for it")
+            say(f"Another process is building gsplat's CUDA kernels in {folder}: waiting for it")
             lock.acquire()
         return built(folder) or _compile(folder, arch)
     except OSError as error:

@@ -123,7 +123,7 @@ def add_photos(
     lost = {targets[n]: left_out.get(n, "too few of its matches agree") for n in targets if n not in found}
     told = reasons_in_words({"without a place": lost, "doubtfully placed": doubtful})
     if not found:
-        raise UserError(f"none of the {len(targets)} new photos finds a place; {'; '.join(told)}")
+        raise UserError(f"none of the {len(targets)} new photos can be placed; {'; '.join(told)}")
     _copy(images, {name: target for name, target in targets.items() if name in found})
     for image in numbers.values():
         model.extract_colors_for_image(image, images)  # only of points without a color

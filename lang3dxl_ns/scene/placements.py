@@ -65,7 +65,7 @@ def doubtful_placements(
         if not accused:
             break
         worst = max(accused, key=accused.__getitem__)
-        reasons[worst] = "most of its matches are with photos that stand elsewhere"
+        reasons[worst] = "most of its matches are with photos placed elsewhere"
     lonely = [p for p in rotations if p not in reasons and supporters[p] < 2 and len(rotations) > 3]
     return reasons | dict.fromkeys(lonely, "only one other photo supports it")
 

@@ -70,7 +70,7 @@ def extract_frames(video: Path, rate: float = FRAMES_PER_SECOND, most: int = MOS
     say(f"{video.name}: {duration:.0f} s, the sharpest frame of each of {stretches} intervals")
     sharpness, change = _looks(video)
     if len(sharpness) < 3:
-        raise UserError(f"{video} has {len(sharpness)} frames: a scene needs a walk of some seconds")
+        raise UserError(f"{video} has {len(sharpness)} frames, too few: record several seconds while moving")
     _write(video, folder, _sharpest(sharpness, change, min(stretches, len(sharpness))))
     replace_file(made_of, json.dumps(this))
     return folder

@@ -62,7 +62,7 @@ export class Answers {
     const best = `the best places fit at ${fit.toFixed(2)}`, told = (level, reason) => ({ level, reason, far: far && !taught, alike });
     const world = far ? `; this scene is ${foreign.toFixed(1)} times as far from what its CLIP was trained on as usual` : "";
     if (isDoubtful && taught) return told("doubtful", `${Math.round(100 * doubt)} % of what was not marked fits as well`);
-    if (doubt === 1) return told("doubtful", "it fits no place: it may not be here, or this scene's CLIP may not know the word");
+    if (doubt === 1) return told("doubtful", "it matches nothing in this scene: it may be absent, or this scene's CLIP may not know the word");
     if (isDoubtful) return told("doubtful", `${Math.round(100 * doubt)} % of unrelated words fit this scene as well`);
     if (taught) return told("sure", "taught by example");
     if (fit < rules.faint) return told("doubtful", `${best}, and other words fit better there: it may not be here`);

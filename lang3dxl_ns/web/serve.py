@@ -115,11 +115,11 @@ class Handler(BaseHTTPRequestHandler):
         page, path = self.server.page, urlsplit(self.path).path
         keep = {"/api/teach": page.teach, "/api/tour": page.keep_tour}.get(path)
         if keep is None or not ours or not 0 < size <= _MOST_MARKS:
-            raise UserError("this server takes the marks of a word from its own page alone")
+            raise UserError("this server takes the marks of a word only from its own page")
         try:
             content = json.loads(self.rfile.read(size))
         except RecursionError as error:
-            raise UserError("these are no marks of a word: load the page again") from error
+            raise UserError("these are not marks of a word: load the page again") from error
         return HTTPStatus.OK, _KINDS["json"], json.dumps(keep(content)).encode()
 
     def _answer(self, answer: Callable[[], tuple[HTTPStatus, str, bytes]]) -> None:

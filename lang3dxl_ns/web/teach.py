@@ -36,7 +36,7 @@ class PageWords:
             name, before = str(content["name"]), str(content["before"])
             examples = [Example.from_json(example) for example in content["examples"]]
         except DAMAGE as error:
-            raise UserError(f"these are no marks of a word ({error}): load the page again") from error
+            raise UserError(f"these are not marks of a word ({error}): load the page again") from error
         with self._one:
             if self.file is None:
                 return self._taught(scene, name, before, examples)
@@ -51,7 +51,7 @@ class PageWords:
         """Keep a page's tour in the scene file, if there is one, and return it. Raises UserError for other
         content."""
         if not isinstance(content, dict) or not isinstance(tour := content.get("tour"), str):
-            raise UserError("this is no tour: load the page again")
+            raise UserError("this is not a tour: load the page again")
         if self.file is not None:
             with self._one, locked(self.file.resolve().parent):
                 keep_words(self.file, {}, tour)

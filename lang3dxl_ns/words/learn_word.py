@@ -97,7 +97,7 @@ def learn(
             trouble = "lie where the scene shows nothing, or cancel out"
             raise UserError(f"the marks of {name!r} in {example.photo} {trouble}")
         if example.shows_word and marked >= 0.98 * everything:
-            raise UserError(f"{name!r} is everything that {example.photo} shows: mark the word alone")
+            raise UserError(f"the marks of {name!r} cover all of {example.photo}: mark only the object")
     rows, photos = _sampled(examples, weights)
     sample = engine.features(rows).double()
     # Margin of the text: the cosine minus the best competitor's.

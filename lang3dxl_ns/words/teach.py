@@ -50,7 +50,7 @@ def carried_word(scene: Answering, word: TaughtWord) -> TaughtWord:
             return learned_word(scene, word.name, marked)
     same = same_clip(word.clip, scene.file.clip_identity)
     if len(word.vector) != scene.semantics()[0].clip_dim or not same:
-        raise UserError(f"{word.name!r} was learned with another CLIP than this scene's: teach it anew")
+        raise UserError(f"{word.name!r} was learned with a CLIP other than this scene's: teach it again")
     return replace(word, examples=(), precision={})
 
 
@@ -58,7 +58,7 @@ def least_certain_photo(scene: Answering, word: str) -> str:
     """Find the training photo in which a taught word is least certain; see `Scene.unsure`."""
     taught = scene.words.get(known_word(word))
     if taught is None:
-        raise UserError(f"{word!r} was not taught: see lang3dxl words")
+        raise UserError(f"{word!r} was not taught: lang3dxl words lists what was")
     check_views(scene)
     chance = ask(scene, taught.name).relevancy[0]
     marked = {scene.file.photo(example.photo).name for example in taught.examples}

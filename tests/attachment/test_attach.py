@@ -192,7 +192,7 @@ def test_mistakes_are_told_before_a_model_is_downloaded_and_an_empty_text_before
     ("splat", "data", "out", "message"),
     [
         ("nothing.ply", None, "a.scene", "does not exist"),
-        ("nothing.ply", None, "a.ply", "end it in .scene"),
+        ("nothing.ply", None, "a.ply", "must have the extension .scene"),
         ("nothing.ply", None, None, "name the file to write"),
     ],
 )

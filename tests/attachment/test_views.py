@@ -33,7 +33,7 @@ def test_up_is_found_wherever_it_points(axis):
 
 
 def test_a_doubtful_up_is_told_with_the_flag_that_sets_the_other(monkeypatch, capsys):
-    for margin, said in ((2.0, "up is about -y"), (0.1, "doubtful: -y (0.00,-1.00,0.10) leads z")):
+    for margin, said in ((2.0, "up is about -y"), (0.1, "uncertain: -y (0.00,-1.00,0.10) leads z")):
         guess = Upright(torch.tensor([0.0, -1, 0.1]), margin, torch.tensor([0.0, 0, 1]))
         monkeypatch.setattr(views, "find_up", lambda *_, guess=guess: guess)
         Extent.of(SPLATS, "auto")

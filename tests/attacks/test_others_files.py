@@ -97,7 +97,7 @@ def test_a_cache_that_came_as_a_link_is_refused_and_a_named_one_is_the_users(tmp
 def test_what_is_no_path_is_told_in_one_line_wherever_one_is_given(path):
     calls = (load_scene, open_capture, read_splats, painted_scene().export, train)
     for call in calls:
-        with pytest.raises(UserError, match=r"is no path .*: choose a shorter name"):
+        with pytest.raises(UserError, match=r"is not a path .*: choose a shorter name"):
             call(path)
 
 

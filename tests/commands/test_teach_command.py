@@ -79,7 +79,7 @@ def test_a_word_of_another_width_is_refused_by_scenes_and_their_files(place):
     teach(place, "--box", DOME)
     scene = read_scene(place, "cpu")
     wide = replace(scene.words["gizmo"], vector=torch.ones(5), examples=())
-    with pytest.raises(UserError, match="another CLIP"):
+    with pytest.raises(UserError, match="a CLIP other than"):
         scene.carrying(wide)
     keep_words(place, {"gizmo": wide})
     with pytest.raises(UserError, match=r"wall\.scene.*another CLIP"):
@@ -189,7 +189,7 @@ def test_words_are_carried_to_another_scene(place, tmp_path, capsys):
     alike.write_text(json.dumps(content))
     main(["words", str(same), "--forget", "gizmo", "--load", str(alike)])
     assert not words(same)["gizmo"].examples
-    with pytest.raises(SystemExit, match="another CLIP"):
+    with pytest.raises(SystemExit, match="a CLIP other than"):
         main(["words", str(foreign), "--load", str(kept)])
 
 
@@ -210,7 +210,10 @@ def test_words_that_are_loaded_do_not_replace_examples_of_the_scene(place, tmp_p
     [
         ({}, "'gizmo' is kept, learned anew from its examples (1)"),
         ({"data": "tower"}, "'gizmo' is kept, as it was"),
-        ({"data": "tower", "clip_identity": "45"}, "'gizmo' is lost: 'gizmo' was learned with another CLIP"),
+        (
+            {"data": "tower", "clip_identity": "45"},
+            "'gizmo' is lost: 'gizmo' was learned with a CLIP other than",
+        ),
     ],
 )
 def test_a_scene_written_over_another_keeps_its_words_and_says_so(place, tmp_path, capsys, change, said):
@@ -253,7 +256,7 @@ def test_a_word_that_is_taught_while_its_scene_is_written_over_stays(place, tmp_
 
 
 def test_another_name_than_a_scenes_is_refused_before_a_folder_is_made(place, tmp_path):
-    with pytest.raises(SystemExit, match=r"a\.ply doesn't name a scene"):
+    with pytest.raises(SystemExit, match=r"a\.ply must have the extension"):
         main(["export", str(place), "--scene-file", str(tmp_path / "new" / "a.ply")])
     assert not (tmp_path / "new").exists()
 

@@ -24,7 +24,7 @@ def test_an_unknown_preset_names_the_known_ones(name):
 
 
 def test_a_preset_that_is_not_a_scene_has_no_flags():
-    with pytest.raises(UserError, match="no preset for training"):
+    with pytest.raises(UserError, match="not a preset for training"):
         train_flags("synonyms/architecture")
 
 

@@ -75,7 +75,7 @@ def test_every_property_of_a_ply_is_in_its_place(tmp_path):
     np.testing.assert_array_equal(rows["f_dc_2"], splats.harmonics[:, 0, 2])
     for channel in range(3):
         np.testing.assert_array_equal(rows[f"f_rest_{3 * channel}"], splats.harmonics[:, 1, channel])
-    with pytest.raises(UserError, match=r"end it in .ply, .spz, .sog or .glb"):
+    with pytest.raises(UserError, match=r"use .ply, .spz, .sog or .glb"):
         write_splats(tmp_path / "all.obj", splats)
 
 

@@ -62,7 +62,7 @@ def test_newer_runs_of_other_methods_are_skipped(runs, tmp_path):
 
 @pytest.mark.parametrize("place", ["nowhere", "nowhere/config.yml", "\0"])
 def test_wrong_places_are_one_sentence(runs, place):
-    with pytest.raises(UserError, match=r"is not a file or folder|is no path"):
+    with pytest.raises(UserError, match=r"is not a file or folder|is not a path"):
         find_config(place)
 
 

@@ -321,7 +321,7 @@ def test_errors_of_the_device_are_not_the_files(written):
 
 
 def test_other_names_are_refused(tmp_path):
-    with pytest.raises(UserError, match=r"end it in .scene"):
+    with pytest.raises(UserError, match=r"must have the extension .scene"):
         write_scene(tmp_path / "a.ply", painted_scene())
     write_splats(tmp_path / "a.ply", painted_splats())
     with pytest.raises(UserError, match=r"a\.ply is not a readable scene .*: a splat .* lang3dxl attach"):

@@ -192,7 +192,7 @@ def test_mistakes_are_reported(config, tmp_path):
 
 def test_a_run_without_semantics_is_refused(trainer):
     file = SceneRecord.read(trainer.base_dir / SCENE_FILE)
-    with pytest.raises(UserError, match="colors alone"):
+    with pytest.raises(UserError, match="only colors"):
         snapshot(trainer.pipeline.model.run, replace(file, clip=None)).query("dome")
 
 

@@ -96,7 +96,7 @@ def test_a_resumed_run_trains_the_sky_that_it_began_with(train, scene):
     again = train(scene, pipeline__model__sky_gaussians=50, **place).pipeline.model
     assert len(again.sky) == again.run.densification.still == COUNT
     assert not torch.equal(again.sky.harmonics, first.pipeline.model.sky.harmonics)
-    with pytest.raises(UserError, match="was trained with sky, which the present settings leave out"):
+    with pytest.raises(UserError, match="was trained with sky, which the current settings leave out"):
         train(scene, pipeline__model__sky_gaussians=0, **place)
 
 

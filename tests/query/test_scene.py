@@ -234,9 +234,9 @@ def test_mistakes_are_reported(scene):
 
 def test_a_scene_of_colors_alone_can_be_seen_but_not_asked():
     scene = Scene(painted_splats(), painted_file())
-    assert scene.render("0003").pixels.any() and "colors alone" in repr(scene)
+    assert scene.render("0003").pixels.any() and "only colors" in repr(scene)
     for ask in (scene.query, scene.find, scene.relevancy, scene.encode):
-        with pytest.raises(UserError, match="colors alone"):
+        with pytest.raises(UserError, match="only colors"):
             ask("dome")
 
 

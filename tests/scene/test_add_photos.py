@@ -213,7 +213,7 @@ def test_where_no_photo_finds_a_place_the_model_stays(scene):
     noise = np.random.default_rng(0).integers(0, 255, (180, 240, 3), np.uint8)
     (scene / "other").mkdir()
     Image.fromarray(noise).save(scene / "other" / "noise.jpg")
-    with pytest.raises(UserError, match=r"none of the 1 new photos finds a place.*other/noise\.jpg"):
+    with pytest.raises(UserError, match=r"none of the 1 new photos can be placed.*other/noise\.jpg"):
         add_photos(scene / "data", scene / "other", None, SIFT)
     assert (scene / "data/sparse/0/images.bin").read_bytes() == before
     assert not (scene / "data/images/other").exists()

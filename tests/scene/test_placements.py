@@ -34,7 +34,7 @@ def test_a_photo_on_the_wrong_side_is_named_alone(ring):
     like = [MatchedPair(3, j, 60, rotations[j] @ rotations[9].T) for j in (8, 9, 10)]
     rotations[3] = rotations[9]
     (found,) = doubtful_placements(rotations, pairs + like).items()
-    assert found == (3, "most of its matches are with photos that stand elsewhere")
+    assert found == (3, "most of its matches are with photos placed elsewhere")
 
 
 def test_false_matches_between_like_sides_do_not_accuse_right_photos(ring):

@@ -138,7 +138,7 @@ def test_what_matches_measure_agrees_with_the_model(reconstructed):
     assert len(pairs) > 6 and doubtful_placements(rotations, pairs) == {}
     rotations[1] = np.diag([-1.0, 1, -1]) @ rotations[1]
     assert doubtful_placements(rotations, pairs) == {
-        1: "most of its matches are with photos that stand elsewhere"
+        1: "most of its matches are with photos placed elsewhere"
     }
 
 

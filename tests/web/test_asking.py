@@ -279,11 +279,11 @@ def test_colors_alone_cant_be_typed_to(browser, tmp_path):
         page = opened(browser, address + "#ask=dome&like=it~1", DESK)
         assert page.get_by_role("combobox", name="Look for").is_disabled()
         assert page.get_by_role("button", name="Ask").is_disabled() and prompts_of(page) == []
-        until_told(page, "#status", "colors alone")
+        until_told(page, "#status", "only colors")
         page.get_by_role("button", name="Walk").click()
         page.get_by_role("button", name="Overview").click()
         until(page, "document.getElementById('walk').ariaPressed", "false")
-        until_told(page, "#status", "colors alone")
+        until_told(page, "#status", "only colors")
         assert page.complaints == []
         page.close()
 

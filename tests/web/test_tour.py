@@ -116,7 +116,7 @@ def test_a_tour_is_kept_in_the_scenes_file_and_plays_from_there(browser, file, t
 
 @pytest.mark.parametrize("content", ["[]", "{}", '{"tour": 3}', "null"])
 def test_what_is_no_tour_is_not_kept(content):
-    with pytest.raises(UserError, match="no tour"):
+    with pytest.raises(UserError, match="not a tour"):
         PageWords().keep_tour(json.loads(content))
 
 
