@@ -12,7 +12,9 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from lang3dxl_ns.components.appearance import AppearanceConfig, AppearanceField
+from lang3dxl_ns.components.decoders import DecoderConfig, make_decoder
 from lang3dxl_ns.components.feature_decoder import Decoder
+from lang3dxl_ns.components.semantic_field import SemanticFieldConfig
 from lang3dxl_ns.query.question import QueryConfig
 from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.rendering import Splats, harmonics_of
@@ -129,6 +131,23 @@ def painted_scene(cache: Path | None = None, config: QueryConfig | None = None, 
     }
     parts |= {"encode_texts": encode_texts, "cache": cache, "config": config or QueryConfig()}
     return Scene(**{**parts, **changes})
+
+
+def decoded(name: str, seed: int = 0) -> dict:
+    """A decoder of this kind with random weights, and codes for the painted Gaussians."""
+    torch.manual_seed(seed)
+    decoder = make_decoder(DecoderConfig(name=name), SemanticFieldConfig(preset="short"), CHANNELS, 0)
+    decoder.requires_grad_(False)
+    count = len(painted_gaussians()["means"])
+    if name == "lifting":
+        codes = torch.randn(count, CHANNELS + 1).abs()
+    elif (codes := decoder.initial_codes(count)) is None and name != "fmgs":
+        codes = torch.randn(count, 3)
+    gaussians = {"means": painted_splats().means}
+    carried = decoder.carried(gaussians if codes is None else gaussians | {"codes": codes}).detach().clone()
+    if name == "gathered":
+        carried[7] = torch.nan
+    return {"decoder": decoder, "codes": carried}
 
 
 def painted_looks(seed: int = 0) -> AppearanceField:

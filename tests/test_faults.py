@@ -13,7 +13,7 @@ from runs import make_trainer
 from scenes import write_scene
 
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.common.memory import machine_memory, with_less_memory
+from lang3dxl_ns.common.memory import with_less_memory
 from lang3dxl_ns.methods import lang3dxl
 from lang3dxl_ns.plugin.dataparser import PhotoCollectionDataParserConfig
 from lang3dxl_ns.plugin.run_checkpoint import check_checkpoint
@@ -241,7 +241,3 @@ def test_what_does_not_fit_even_one_by_one_is_an_error_and_others_are_not_hidden
         with_less_memory(lambda rows: short_of_memory(0, len)(range(rows)), 8)
     with pytest.raises(RuntimeError, match="size"):
         with_less_memory(lambda rows: torch.zeros(2) @ torch.zeros(3), 8)
-
-
-def test_memory_is_that_of_the_container():
-    assert 2**28 < machine_memory() < 2**50

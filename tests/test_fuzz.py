@@ -1,17 +1,20 @@
 """Fuzzing of file readers: any input gives a result or a `UserError`."""
 
 import contextlib
+import gzip
 import json
 import os
 import shutil
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 import yaml
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from painted_scene import decoded, painted_looks, painted_scene, painted_splats
 from PIL import Image
 from scenes import write_scene
 
@@ -21,6 +24,10 @@ from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.pictures import FORMATS
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth
 from lang3dxl_ns.evaluation.layouts import read_lerf_ovs
+from lang3dxl_ns.files.read_splats import read_splats
+from lang3dxl_ns.files.scene_file import read_scene
+from lang3dxl_ns.files.scene_file import write_scene as write_scene_file
+from lang3dxl_ns.files.splat_file import write_splats
 from lang3dxl_ns.methods import lang3dxl
 from lang3dxl_ns.plugin.run_checkpoint import check_checkpoint, read_checkpoint
 from lang3dxl_ns.plugin.trainer_config import read_config
@@ -55,8 +62,10 @@ JSON = st.recursive(
 
 @st.composite
 def damage(draw, content: bytes) -> bytes:
-    """Truncated, bytes changed, a stretch repeated or removed; sometimes entirely random."""
-    how = draw(st.sampled_from(["cut", "change", "change", "repeat", "remove", "other"]))
+    """Truncated, bytes changed or numbers made large, a stretch repeated or removed, often in the header;
+    sometimes entirely random."""
+    how = draw(st.sampled_from(["cut", "change", "change", "enlarge", "repeat", "remove", "other"]))
+    last = min(draw(st.sampled_from([40, 4000, len(content)])), len(content)) - 1
     if how == "other":
         return draw(st.binary(max_size=64))
     if how == "cut":
@@ -64,9 +73,11 @@ def damage(draw, content: bytes) -> bytes:
     if how == "change":
         changed = bytearray(content)
         for _ in range(draw(st.integers(1, 8))):
-            changed[draw(st.integers(0, len(content) - 1))] = draw(st.integers(0, 255))
+            changed[draw(st.integers(0, last))] = draw(st.integers(0, 255))
         return bytes(changed)
-    start, length = draw(st.integers(0, len(content))), draw(st.integers(1, 64))
+    start, length = draw(st.integers(0, last)), draw(st.integers(1, 64))
+    if how == "enlarge":
+        return content[:start] + b"\xff\xff\xff\x7f" + content[start + 4 :]
     piece = content[start : start + length]
     return content[:start] + (piece * 2 if how == "repeat" else b"") + content[start + length :]
 
@@ -141,8 +152,6 @@ def test_ground_truth(pictures, tmp_path, data):
 @fuzz
 @given(data=st.data())
 def test_label_maps(tmp_path, data):
-    import numpy as np
-
     np.save(tmp_path / "whole.npy", np.arange(12).reshape(3, 4))
     (tmp_path / "a.npy").write_bytes(data.draw(damage((tmp_path / "whole.npy").read_bytes())))
     photo = Photo("a.jpg", tmp_path / "a.jpg", None, Lens(8, 6, 5.0, 5.5, 4.0, 3.0))
@@ -301,6 +310,42 @@ def test_files_that_people_hand_on(tmp_path, kind, data):
     except UserError as error:
         said = str(error)
     assert "\n" not in said and len(said) < 800
+
+
+@pytest.fixture(scope="module")
+def scenes(tmp_path_factory):
+    """A scene and its splats, by the ending of their names."""
+    gsply = pytest.importorskip("gsply")
+    at, splats = tmp_path_factory.mktemp("scenes"), painted_splats(along=6)
+    write_scene_file(at / "a.scene", painted_scene(**decoded("gathered"), looks=painted_looks()))
+    for kind in ("ply", "spz", "sog", "glb"):
+        write_splats(at / f"a.{kind}", splats)
+    header, body = (at / "a.ply").read_bytes().split(b"end_header\n")
+    rows = np.frombuffer(body, "<f4").reshape(len(splats), -1).tolist()
+    text = "\n".join(" ".join(map(str, row)) for row in rows).encode()
+    header = header.replace(b"binary_little_endian", b"ascii")
+    (at / "a.ascii.ply").write_bytes(header + b"end_header\n" + text)
+    gsply.write_spz(at / "a.4.spz", gsply.read_spz(at / "a.spz"), version=4)
+    (at / "a.splat").write_bytes(np.ones((64, 8), "<f4").tobytes())
+    for path in at.iterdir():  # a file that is refused undamaged would hide everything
+        (read_scene if path.suffix == ".scene" else read_splats)(path)
+    return {path.name.removeprefix("a."): path.read_bytes() for path in at.iterdir()}
+
+
+@pytest.mark.parametrize("kind", ["scene", "ply", "ascii.ply", "spz", "4.spz", "sog", "glb", "splat"])
+@fuzz
+@given(data=st.data())
+def test_scenes_and_splats(scenes, tmp_path, kind, data):
+    """What is read is finite; what is refused is named."""
+    path, zipped = tmp_path / f"a.{kind}", kind == "spz"
+    content = data.draw(damage(gzip.decompress(scenes[kind]) if zipped else scenes[kind]))
+    path.write_bytes(gzip.compress(content) if zipped else content)
+    said = path.name
+    try:
+        sound = read_scene(path, "cpu") if kind == "scene" else read_splats(path).sound().all()
+    except UserError as error:
+        sound, said = True, str(error)
+    assert sound and path.name in said and "\n" not in said
 
 
 # ── names of files ──────────────────────────────────────────────────────────────────────────────────────

@@ -138,7 +138,7 @@ STILL_ANY = {
     *("preparation/needs.py photo", "files/ply.py data"),  # of pycolmap and gsply
     *("scene/record.py file", "scene/transforms.py files", "plugin/trainer_config.py before"),  # from files
     *("files/scene_file.py kind", "rendering/simd.py kind"),  # of NumPy and numba
-    *("plugin/inert_settings.py settings", "plugin/run_settings.py settings"),  # of any class
+    "plugin/run_settings.py settings",  # of any class
     *("plugin/wrong_flags.py settings", "training/fit.py settings"),
     "query/scene.py place",
 }

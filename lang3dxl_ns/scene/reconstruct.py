@@ -146,7 +146,7 @@ def _best_mapping(
         return plain
     found = f"{plain.placed} of {count} photos have a pose"
     if count > _MOST_STRONG:
-        say(f"{found}: --features dsp-sift places more, in three times the time")
+        say(f"{found}: `lang3dxl reconstruct --features dsp-sift` places more, in three times the time")
         return plain
     say(f"{found}: trying stronger features, three times as slow")
     strong = mapped(work / "dsp-sift", replace(settings, features="dsp-sift"))

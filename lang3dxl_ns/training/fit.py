@@ -99,7 +99,7 @@ class Settings(RunSettings):
         if owner is None:
             known = [setting.name for part in owners for setting in fields(part)]
             near = "".join(f"did you mean {n}? " for n in get_close_matches(name, known, n=1))
-            raise UserError(f"there is no setting {name}: {near}help(lang3dxl_ns.train) tells which there are")
+            raise UserError(f"there is no setting {name}: {near}help(lang3dxl_ns.train) names them")
         kind = get_type_hints(type(owner))[attribute]
         if isinstance(value, str) and kind in (Path, Path | None):
             value = Path(value)

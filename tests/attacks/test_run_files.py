@@ -2,7 +2,6 @@
 
 import json
 import math
-import os
 
 import pytest
 
@@ -120,9 +119,3 @@ def test_poses_written_as_integers_are_poses(tmp_path):
     whole = [[int(value) for value in row] for row in POSE]
     path = scene_file(tmp_path, set_of_photo("camera_to_world", whole))
     assert SceneRecord.read(path).photos[1].camera.view_matrix.is_floating_point()
-
-
-def test_pipes_are_refused_instead_of_waited_for(tmp_path):
-    os.mkfifo(tmp_path / "file.json")
-    with pytest.raises(UserError, match=r"file\.json"):
-        SceneRecord.read(tmp_path / "file.json")

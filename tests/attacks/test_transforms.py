@@ -134,11 +134,7 @@ def test_unknown_camera_models_are_told_by_name(folder, model):
         open_capture(write(folder, top={"camera_model": model}))
 
 
-def test_pipes_are_refused_instead_of_waited_for(folder):
-    os.mkfifo(folder / "transforms.json")
-    with pytest.raises(UserError, match="not a regular file"):
-        open_capture(folder)
-    (folder / "transforms.json").unlink()
+def test_masks_that_are_pipes_are_refused_instead_of_waited_for(folder):
     os.mkfifo(folder / "images" / "pipe.png")
     with pytest.raises(UserError, match="none of the 1 photos"):
         open_capture(write(folder, mask_path="images/pipe.png"))

@@ -19,7 +19,10 @@ pytestmark = pytest.mark.nerfstudio  # for the options of ns-train
 
 PACKAGE = Path(lang3dxl_ns.__file__).parent
 FILES = sorted(path.relative_to(PACKAGE).as_posix() for path in PACKAGE.rglob("*.py"))
-OF_ONE_COMMAND = {"training/fit.py": "train", "training/checkpoint.py": "train", "attachment": "attach"}
+OF_ONE_COMMAND = {
+    **{"training/fit.py": "train", "training/checkpoint.py": "train"},
+    **{"attachment": "attach", "scene/add_photos.py": "reconstruct"},
+}
 OF_BOTH = ("common", "scene", "components", "rendering", "preparation", "training")
 """Rooms that speak to users of `lang3dxl train` and of `ns-train`, which spell options differently."""
 COMMAND = re.compile(

@@ -173,7 +173,8 @@ def finished(scene, tiny_clip, tiny_dense, tmp_path_factory):
 def test_a_finished_run_can_be_prolonged_while_gaussians_multiply(train, scene, finished):
     longer = train(scene, iterations=8, load_dir=finished.checkpoint_dir)
     model = longer.pipeline.model
-    assert longer.words_are_learned
+    assert longer._start_step == 3 and longer.words_are_learned
+    assert [path.name for path in longer.checkpoint_dir.iterdir()] == ["step-000000007.ckpt"]
     assert len(model.gauss_params["codes"]) == model.num_points > finished.pipeline.model.num_points
 
 

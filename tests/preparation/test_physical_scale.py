@@ -109,27 +109,6 @@ def test_a_resized_photo_shows_the_same_physical_crops(angle):
     assert small.pixels / [800, 600] == pytest.approx(photo.pixels / [1600, 1200])
 
 
-def test_a_rescaled_world_scales_sizes_linearly(scene):
-    reconstruction = read_reconstruction(scene / "sparse" / "0")
-    pose = np.array([[1, 1, 1, 7.0]])
-    scaled = Reconstruction(
-        {
-            name: replace(photo, points=7 * photo.points, camera_from_world=photo.camera_from_world * pose)
-            for name, photo in reconstruction.photos.items()
-        },
-        7 * reconstruction.points,
-        reconstruction.colors,
-    )
-    sizes, scaled_sizes = pixel_sizes(reconstruction)[0], pixel_sizes(scaled)[0]
-    assert list(scaled_sizes.values()) == pytest.approx([7 * size for size in sizes.values()])
-    proposed, scaled_proposed = (
-        propose_scale_range(reconstruction, sizes),
-        propose_scale_range(scaled, scaled_sizes),
-    )
-    assert scaled_proposed.smallest == pytest.approx(7 * proposed.smallest)
-    assert scaled_proposed.largest == pytest.approx(7 * proposed.largest)
-
-
 def test_points_whose_pixels_are_not_recorded_count_where_the_camera_sees_them():
     """Scenes without a COLMAP model have points alone."""
     points, pixels = [(0, 0, 10), (0, 13.5, 30), (9, 0, 20)], [(500, 500), (500, 950), (950, 500)]
