@@ -55,7 +55,7 @@ COMMANDS = {
     "evaluate pool --out report --reports silent.json": "it does not say what was scored",
     "evaluate pool --out report --reports none.json": "there is no none.json",
     "export": "give one of --out FILE.ply, --web FOLDER",
-    "export --out a.ply --text dome --text tower": "a splat file holds the matches of one --text",
+    "export --out a.ply --text dome --text tower": "a splat file holds one --text",
     "doctor --build": "name a compute capability, such as --arch 8.6",
     "benchmark gpu --out report": "lang3dxl doctor says why",
     "demo-scene --out s --photos 2": "--photos is 2",

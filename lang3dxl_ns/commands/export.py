@@ -79,9 +79,7 @@ class Export(OfScene):
             make_folder(self.out.parent)
             check_splat_name(self.out)
             if len(prompts) > 1:
-                raise UserError(
-                    "a splat file holds the matches of one --text: write several files, or a page (--web)"
-                )
+                raise UserError("a splat file holds one --text: write several files, or a page (--web)")
         scene = load_scene(self.scene, settings=self.settings, clip=self.clip)
         write = {"out": self._splat, "web": self._page, "scene_file": self._scene, "video": self._video}
         prompts = parse_texts(self.text, self.not_, scene.words)

@@ -177,9 +177,7 @@ def expanded(path: str | Path) -> Path:
     name = os.fsencode(path)
     if b"\0" in name or len(name) > _LONGEST_PATH or any(len(part) > 255 for part in name.split(b"/")):
         begin = os.fsdecode(name[:60])
-        raise UserError(
-            f"{begin} … is not a path (it is too long, or has a null character): choose a shorter name"
-        )
+        raise UserError(f"{begin} … is not a path (too long, or a null character): choose a shorter name")
     try:
         return Path(path).expanduser()
     except RuntimeError as error:

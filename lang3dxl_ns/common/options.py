@@ -5,20 +5,18 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-_DATA, _MODEL = "--pipeline.datamanager.", "--pipeline.model."
-OWN_NAMES = {"appearance.use": "looks"}
-"""Settings that our own commands call otherwise."""
+OWN_NAMES = {"appearance.use": "looks"}  # of settings that our own commands call otherwise
 
 
 def data_option(name: str) -> str:
     """Spell an option of photos and their targets, such as `clip`: nerfstudio's commands have it at the
     setting's place in their configuration, our own by its name."""
-    return f"{_DATA if _in_nerfstudio() else '--'}{name}"
+    return f"{'--pipeline.datamanager.' if _in_nerfstudio() else '--'}{name}"
 
 
 def model_option(name: str) -> str:
     """Spell an option of the model, such as `max-gaussians` (see `data_option`)."""
-    return f"{_MODEL}{name}" if _in_nerfstudio() else f"--{OWN_NAMES.get(name, name)}"
+    return f"--pipeline.model.{name}" if _in_nerfstudio() else f"--{OWN_NAMES.get(name, name)}"
 
 
 def switched_on(option: str) -> str:

@@ -70,16 +70,13 @@ def read_header(file: BinaryIO) -> tuple[str, dict[str, Table], list[str]]:
     expect(form == "ascii" or announced <= size, "it announces more than it holds")
     row = 0 if form == "ascii" or any(table.lists for table in tables.values()) else table.row().itemsize
     if row and announced and size - announced >= row:
-        more = (size - announced) // row
-        say(f"{file.name} holds {more} rows more than its header announces: they are left out")
+        say(f"{file.name} holds {(size - announced) // row} rows more than its header announces: left out")
     return form, tables, lines
 
 
 def _type(name: str, column: str) -> str:
     if name not in _TYPES:
-        raise UserError(
-            f"its column {column} has the type {name}, which PLY files don't have: export it again"
-        )
+        raise UserError(f"its column {column} has the type {name}, which PLY lacks: export it again")
     return _TYPES[name]
 
 

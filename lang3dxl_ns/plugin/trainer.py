@@ -212,9 +212,7 @@ class Lang3DXLTrainer(Trainer):
         data = self.pipeline.datamanager.data
         frame = data.capture.recorded_frame
         if not before.has_frame(frame.transform, frame.scale):
-            raise UserError(
-                f"{path} belongs to other photos, or to another reconstruction of them: train anew"
-            )
+            raise UserError(f"{path} belongs to other photos or another reconstruction of them: train anew")
         splits = [{p.name: p.split for p in file.photos} for file in (before, data.record())]
         trained = [[name for name, split in known.items() if split == "train"] for known in splits]
         if corrected and trained[0] != trained[1]:

@@ -92,9 +92,7 @@ class Lang3DXLTrainerConfig(RunConfig):
         own = super().get_checkpoint_dir().absolute()
         continues = resumed is not None and resumed.absolute().parent == own
         if not (fresh or continues) and any(own.glob("*.ckpt")):
-            raise UserError(
-                f"{own} belongs to an earlier run: resume it with --load-dir, or change --timestamp"
-            )
+            raise UserError(f"{own} holds an earlier run: resume it with --load-dir, or change --timestamp")
         data = self.pipeline.datamanager
         check_encoders(data.clip, data.dense)
         check_device(self.machine.device_type, self.pipeline.model.rasterizer)

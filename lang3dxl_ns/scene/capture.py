@@ -37,7 +37,7 @@ from lang3dxl_ns.scene.masks import mask_folder
 from lang3dxl_ns.scene.matching import shows_these
 from lang3dxl_ns.scene.names import listed, resolve
 from lang3dxl_ns.scene.photo import Photo, upright_in_model
-from lang3dxl_ns.scene.photo_folder import find_photos, photos_below
+from lang3dxl_ns.scene.photo_folder import check_data, find_photos, photos_below
 from lang3dxl_ns.scene.reconstruct import reconstruct_scene
 from lang3dxl_ns.scene.transforms import SPLITS, TRANSFORMS, Transforms, read_transforms
 from lang3dxl_ns.scene.video import extract_frames, frames_folder, is_video
@@ -197,8 +197,7 @@ def open_capture(
         first = next(iter(capture.left_out.items()), ("", "it lists none"))
         raise UserError(
             f"none of the {len(capture.left_out)} photos of {folder} can be used; the first: "
-            f"{': '.join(first)}. Put the photos into images/ there, or tell ns-train their folder with "
-            "`lang3dxl-colmap --images-path FOLDER` after all other options"
+            f"{': '.join(first)}. Put them into images/ there (ns-train: or lang3dxl-colmap --images-path)"
         )
     return _without_lost_cameras(capture)
 
@@ -213,8 +212,7 @@ def find_source(
         folder = extract_frames(folder) if may_reconstruct else frames_folder(folder)
     if folder.suffix == ".json" and folder.is_file():
         return folder.parent, folder
-    if not folder.is_dir():
-        raise UserError(f"{folder} is not a folder: give the folder with your photos, or a video")
+    check_data(folder)
     if settings.colmap_path is not None:
         return folder, folder / settings.colmap_path
     if (whole := whole_scene(folder)) != folder:

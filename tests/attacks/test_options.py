@@ -147,7 +147,7 @@ def test_a_run_of_the_same_name_keeps_its_checkpoints(tmp_path, scene):
 
     (checkpoints := config_of_mine().get_checkpoint_dir()).mkdir(parents=True)
     torch.save({}, checkpoints / "step-000000400.ckpt")
-    with pytest.raises(UserError, match="belongs to an earlier run: resume it"):
+    with pytest.raises(UserError, match="holds an earlier run: resume it"):
         config_of_mine()
     config_of_mine(load_dir=checkpoints)
     with pytest.raises(UserError, match="clip-weight has no effect"):

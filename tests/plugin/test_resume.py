@@ -86,7 +86,7 @@ def test_a_run_of_another_scene_is_not_resumed(train, scene, whole, tmp_path):
     shutil.copy(whole.checkpoint_dir / "step-000000010.ckpt", folder)
     told = SceneRecord.read(whole.base_dir / SCENE_FILE)
     replace(told, scale=1.1 * told.scale).write(folder.with_name(SCENE_FILE))
-    with pytest.raises(UserError, match="belongs to other photos, or to another reconstruction of them"):
+    with pytest.raises(UserError, match="belongs to other photos or another reconstruction of them"):
         train(scene, iterations=20, load_dir=folder, **EVERYTHING)
 
 

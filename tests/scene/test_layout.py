@@ -66,6 +66,9 @@ def test_of_several_models_the_largest_is_used_and_the_others_are_told(scene, ca
     shutil.rmtree(scene / "small")
     assert len(open_capture(scene, may_reconstruct=False).photos) == 3
     assert "sparse/1 with 2, sparse/2 with 3" in capsys.readouterr().out
+    assert len(open_capture(scene / "sparse/1", may_reconstruct=False).photos) == 2
+    assert "used is sparse/1 with 2 photos" in (said := capsys.readouterr().out)
+    assert "sparse/2 with 3: to use one of them, give its folder" in said
 
 
 @pytest.mark.parametrize("part", ["sparse/0", "images"])
