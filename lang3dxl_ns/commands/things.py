@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 
 import tyro
 
-from lang3dxl_ns.common.console import say, some
+from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.settings_help import OfScene, showing
 
@@ -34,40 +35,50 @@ class ListThings(OfScene):
 
     def main(self) -> None:
         from lang3dxl_ns.open_scene import load_scene
-        from lang3dxl_ns.query.text import caution
-        from lang3dxl_ns.things.grammar import answer, parse, sight_of, unsure
+        from lang3dxl_ns.query.ask import prompts_of
+        from lang3dxl_ns.query.text import Prompt, caution
+        from lang3dxl_ns.things.grammar import in_words, meant, parse, sight_of
         from lang3dxl_ns.things.write import write_catalog, write_picture, write_things
 
-        requests = [(text, parse(text)) for text in self.ask]
-        words = list(dict.fromkeys([*self.text, *(word for _, asked in requests for word in asked.words)]))
-        if not words:
+        if not (self.text or self.ask):
             raise UserError("give --text or --ask: say which things to look for, such as --text windows")
         if self.splats and self.out is None:
             raise UserError("--splats writes files: give --out too")
         scene = load_scene(self.scene, clip=self.clip)
-        if self.view is not None:
-            scene.file.photo(self.view)
-        answers = scene.things(words)
-        by_word = dict(zip(words, answers, strict=True)) if len(answers) == len(words) else {}
-        for one in answers:
+        seen = None if self.view is None else sight_of(scene, [], self.view)
+        asked, refused = {}, list[str]()
+        for text in self.ask:
+            with _noted(text, refused):
+                asked[text] = parse(text, scene.words)
+        wanted = [*self.text, *(Prompt(word) for request in asked.values() for word in request.words)]
+        prompts = list(dict.fromkeys(prompts_of(scene, wanted) if wanted else ()))
+        answers = scene.things(prompts) if prompts else []
+        by_word = {p.text: one for p, one in zip(prompts, answers, strict=True) if not p.negatives}
+        for prompt, one in zip(prompts, answers, strict=True):
             say(f"{one.word}: {one.count}" + (f" ({one.caution})" if one.caution else ""))
-            if one.word not in scene.words and (advice := caution(one.word)):
-                say(f"  {advice}")
-        for text, request in requests:
-            if not by_word:
-                raise UserError("--text holds several prompts: repeat the flag instead")
-            named = [by_word[word] for word in request.words]
-            sight = partial(sight_of, scene, photo=self.view)
-            chosen = answer(request, named, sight)
-            whole = request.count and not (request.relation or request.without)
-            told = by_word[request.word].count if whole else str(len(chosen))
-            if chosen and not request.count:
-                told += ": " + some([f"{thing.id} in {thing.sightings[0].photo}" for thing in chosen])
-            doubt = None if whole else unsure(request, named, sight)  # the range of a count tells it
-            say(f"{text}: {told}" + (f" (unsure, since {doubt})" if doubt else ""))
-        if self.out is not None:
+            if prompt.taught is None:
+                other = meant(one.word, scene.words)
+                advice = caution(one.word), other and f"did you mean {other}?"
+                say(*(f"  {line}" for line in advice if line))
+        for text, request in asked.items():
+            with _noted(text, refused):
+                found = [by_word[word] for word in request.words]
+                say(f"{text}: {in_words(request, found, lambda things: seen or sight_of(scene, things))}")
+        if self.out is not None and answers:
             write_catalog(scene, answers, self.out)
             write_picture(scene, answers, self.out / "things.png")
             if self.splats:
                 write_things(scene, answers, self.out / "splats")
             say(f"Wrote the things to {self.out}")
+        if not self.text and len(refused) == len({*self.ask}):
+            raise UserError("; ".join(refused))
+        say(*refused)
+
+
+@contextmanager
+def _noted(text: str, refused: list[str]) -> Iterator[None]:
+    """Note why a question has no answer, and go on with the next one."""
+    try:
+        yield
+    except UserError as error:
+        refused.append(f"{text}: {error}" if not str(error).startswith(text) else str(error))

@@ -8,15 +8,16 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 TABLE: dict[str, Any] = json.loads(Path(__file__).with_suffix(".json").read_text(encoding="utf-8"))
-_HELD = "\ue000"
-"""Stands for a separator that is part of a phrase."""
+HELD = "\ue000"
+"""Surrounds the number of a part that is held."""
+_CURLY_QUOTES = str.maketrans("“”„«»", '"""""')
 
 
 @dataclass(frozen=True)
@@ -36,20 +37,37 @@ class Meaning:
         return [text.replace("{target}", self.target).replace("{part}", part) for text, part in told]
 
 
-def phrases_of(typed: str, names: Iterable[str] = ()) -> list[tuple[str, list[str]]]:
-    """Split what was typed into prompts, each with its negatives. `;`, commas and *and* separate prompts,
-    *not* begins negatives, and quotes protect what they hold, as do `names`, such as *lords and ladies*. An
-    empty prompt has negatives alone."""
-    held: list[str] = []
+def held(typed: str, names: Iterable[str] = ()) -> tuple[str, Callable[[str], str]]:
+    """Put a placeholder, which is one word, in place of every part that quotes hold, and of `names`, such as
+    *lords and ladies*. Return the text with single spaces, and a function that puts the parts back, without
+    quotes."""
+    parts: list[str] = []
 
     def hold(found: re.Match[str]) -> str:
-        held.append(found[0])
-        return f"{_HELD}{len(held) - 1}{_HELD}"
+        parts.append(found[0])
+        return f"{HELD}{len(parts) - 1}{HELD}"
 
-    text = re.sub(r'"[^"]*"', hold, typed)
-    text = _words((*TABLE["one"], *names)).sub(hold, text)
+    def restored(text: str) -> str:
+        text = re.sub(f"{HELD}(\\d+){HELD}", lambda found: parts[int(found[1])], text)
+        return " ".join(text.replace('"', " ").split())
+
+    text = straight(typed).replace("\0", " ").replace(HELD, " ")
+    whole = re.compile(rf'"[^"]*"|{_words((*TABLE["one"], *names)).pattern}', re.IGNORECASE)
+    # Single spaces, since runs of them would take patterns a time that grows with their square.
+    return whole.sub(hold, " ".join(text.split())), restored
+
+
+def straight(text: str) -> str:
+    """Return a text with straight double quotes in place of curly ones and of single ones in pairs."""
+    return re.sub(r"‘([^‘’]*)’", r'"\1"', text.translate(_CURLY_QUOTES))
+
+
+def phrases_of(typed: str, names: Iterable[str] = ()) -> list[tuple[str, list[str]]]:
+    """Split what was typed into prompts, each with its negatives. `;`, commas and *and* separate prompts,
+    *not* begins negatives, and quotes and `names` are never split. An empty prompt has negatives alone."""
+    text, restored = held(typed, names)
     shown = [
-        (_restored(prompt, held), [_restored(phrase, held) for phrase in negatives])
+        (restored(prompt), [restored(phrase) for phrase in negatives])
         for part in text.split(";")
         for prompt, negatives in _split(part)
     ]
@@ -68,11 +86,6 @@ def _split(part: str) -> list[tuple[str, list[str]]]:
 def _listed(text: str) -> list[str]:
     parts = (part for piece in text.split(",") for part in _pattern("and").split(piece))
     return [part for part in parts if part.strip()]
-
-
-def _restored(text: str, held: Sequence[str]) -> str:
-    text = re.sub(f"{_HELD}(\\d+){_HELD}", lambda found: held[int(found[1])], text)
-    return " ".join(text.replace('"', " ").split())
 
 
 @cache

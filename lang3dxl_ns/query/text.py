@@ -17,7 +17,7 @@ from torch import Tensor
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.preparation.encoders import load_image_text_encoder
 from lang3dxl_ns.query.doubt import UNRELATED
-from lang3dxl_ns.query.language import meaning, phrases_of
+from lang3dxl_ns.query.language import meaning, phrases_of, straight
 from lang3dxl_ns.query.negatives import NEGATIVES, competitors
 from lang3dxl_ns.query.relevancy import Queries
 from lang3dxl_ns.query.vocabulary import searched, synonyms_of
@@ -31,8 +31,6 @@ NO_SEMANTICS = "this scene has only colors (it was trained with clip none): it c
 _SAME = 0.95
 """Cosine from which a vector and a phrase are taken to mean the same."""
 _QUOTED = r'"[^"]*"'
-_SINGLE_QUOTES = re.compile(r"‘([^‘’]*)’")
-_CURLY_QUOTES = str.maketrans("“”„«»", '"""""')
 
 
 @dataclass(frozen=True)
@@ -76,9 +74,7 @@ def parse_prompts(typed: str, names: Iterable[str] = ()) -> list[Prompt]:
     Quotes protect a phrase, and `names` are never split. The grammar is in `query/language.py`. Raises
     UserError if there is no prompt."""
     (clean,) = texts_of([typed], "a prompt")
-    clean = _SINGLE_QUOTES.sub(r'"\1"', clean.translate(_CURLY_QUOTES)).replace("\0", " ")
-    # Single spaces, since runs of them would take patterns a time that grows with their square.
-    found = phrases_of(" ".join(clean.split()), names)
+    found = phrases_of(clean, names)
     if not found:
         raise UserError("the prompt is empty: type what to look for, such as rose window")
     if alone := [negatives for text, negatives in found if not text]:
@@ -93,7 +89,7 @@ def tidy(text: str) -> str:
 
 def listed_phrases(texts: Iterable[str]) -> list[str]:
     """Return the phrases of texts that may list several, separated by `;` or commas, quoted or not."""
-    parts = (re.findall(rf"{_QUOTED}|[^;,]+", text.translate(_CURLY_QUOTES)) for text in texts)
+    parts = (re.findall(rf"{_QUOTED}|[^;,]+", straight(text)) for text in texts)
     return [phrase for found in parts for part in found if (phrase := tidy(part))]
 
 

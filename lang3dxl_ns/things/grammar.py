@@ -8,17 +8,23 @@ from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from jaxtyping import Float
 from numpy import ndarray as Array
 
+from lang3dxl_ns.common.console import some
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import read_json
-from lang3dxl_ns.query.language import TABLE
+from lang3dxl_ns.query.language import HELD, TABLE, held
 from lang3dxl_ns.query.scene import Scene
+from lang3dxl_ns.query.vocabulary import closest_word, common_words
+from lang3dxl_ns.rendering import Camera
+from lang3dxl_ns.scene.camera import in_camera_frame
 from lang3dxl_ns.things.find import MISSED, Things, up_of
 from lang3dxl_ns.things.thing import Thing
 
@@ -45,7 +51,7 @@ class Request:
     count: bool = False
     superlative: str | None = None
     nth: int | None = None
-    """Place in the order `along`, from 1."""
+    """Place in the order of the superlative, or `along`, from 1."""
     along: str | None = None
     """Side from which things are numbered."""
     relation: str | None = None
@@ -72,37 +78,66 @@ class Sight:
     right: Float[Array, "3"]
     up: Float[Array, "3"]
     ahead: Float[Array, "3"]
+    shows: Callable[[Thing], bool] | None = None
+    """Tells which things one sees: the order from left to right is theirs; None: all."""
 
 
 def sight_of(scene: Scene, things: list[Thing], photo: str | None = None) -> Sight:
-    """Return the directions of a photo's viewer; by default of the photo that shows most of the things."""
+    """Return the directions of a photo's viewer, and what the photo shows; by default of the photo that shows
+    most of the things, and all things."""
     names = [sighting.photo for thing in things for sighting in thing.sightings]
-    if photo is None and names:
-        photo = max(sorted(set(names)), key=names.count)
-    shown = scene.overview if photo is None else scene.file.photo(photo)
+    best = max(sorted(set(names)), key=names.count) if names else scene.overview.name
+    shown = scene.file.photo(best if photo is None else photo)
     up = up_of(scene)
     ahead = -np.array(shown.camera_to_world)[:, 2]
     ahead = ahead - up * (ahead @ up)
     ahead /= max(np.linalg.norm(ahead), 1e-9)
-    return Sight(np.cross(ahead, up), up, ahead)
+    return Sight(np.cross(ahead, up), up, ahead, None if photo is None else _shown_by(scene, shown.camera))
+
+
+def _shown_by(scene: Scene, camera: Camera) -> Callable[[Thing], bool]:
+    """Tell the things whose middle lies in a camera's frame, at most their width behind what it sees."""
+    depth, lens = scene.draw(camera).depth.cpu().numpy(), camera.intrinsics.cpu().numpy()
+
+    def shows(thing: Thing) -> bool:
+        (seen,) = in_camera_frame(camera, torch.from_numpy(thing.center[None])).cpu().numpy()
+        x, y = (lens[:2] @ seen / max(seen[2], 1e-9)).astype(int)
+        inside = seen[2] > 0 and 0 <= x < camera.width and 0 <= y < camera.height
+        return bool(inside and seen[2] < depth[y, x] + thing.size[:2].max())
+
+    return shows
 
 
 Facing = Callable[[list[Thing]], Sight]
 """Returns the directions in which some things are seen."""
 
 
-def parse(text: str) -> Request:
-    """Parse a question. Raises UserError, which names the part, for what the grammar doesn't know."""
+def parse(text: str, names: Iterable[str] = ()) -> Request:
+    """Parse a question. Quotes hold a phrase, and so do `names`, which were taught. Raises UserError, which
+    names the part, for what the grammar doesn't know."""
     words = table()
-    rest = " ".join(text.lower().strip(" ?!.").split())
+    rest, restored = held(text, names)
+    rest = " ".join(rest.lower().strip(" ?!.").split())
     count, rest = _taken(rest, TABLE["count"])
     _, rest = _taken(rest, TABLE["lead"])
     relation, tail = _any(words["relations"]), _any(words["tail"])
     idle = rf" (?:that |which )?(?:are|is)(?: there)?(?= (?:{relation}) )| (?:{tail})$"
-    return replace(_request(re.sub(idle, "", rest)), count=count)
+    try:
+        return replace(_request(re.sub(idle, "", rest), restored), count=count)
+    except UserError as error:
+        raise UserError(restored(str(error)).replace(" :", ":")) from None
 
 
-def _request(rest: str) -> Request:
+def meant(name: str, names: Iterable[str] = ()) -> str | None:
+    """Return the question that a prompt with a misspelled beginning most likely means, such as *highest
+    tower*; None if there is none. `names` were taught."""
+    first, _, noun = name.partition(" ")
+    begin = [word for word in (*table()["superlatives"], *table()["ordinals"]) if word not in table()["from"]]
+    word = closest_word(first, (*begin, *" ".join((*names, *common_words())).split()))
+    return f"{word} {noun}" if noun and word in begin else None
+
+
+def _request(rest: str, restored: Callable[[str], str]) -> Request:
     words = table()
     without, relation, others = None, None, tuple[Request, ...]()
     if found := re.fullmatch(r"(.+?) (?:but )?not (.+)", rest):
@@ -110,25 +145,27 @@ def _request(rest: str) -> Request:
     found = re.fullmatch(rf"(.+?) ({_any(words['relations'])}) (.+)", rest)
     if found and _plain(found[3]) not in words["from"]:  # *on the left* names no thing
         rest, relation = found[1], words["relations"][found[2]]
-        others = tuple(_request(part) for part in re.split(r"\s+and\s+", found[3]))
+        others = tuple(_request(part, restored) for part in re.split(r"\s+and\s+", found[3]))
         if len(others) > (2 if relation == "between" else 1):
             raise UserError(f"{found[2]} {found[3]}: name one thing, or two with between … and …")
     along, nth, superlative = None, None, None
-    if found := re.fullmatch(rf"(.+?) (?:from|on) the ({_any(words['from'])})", rest):
+    if found := re.fullmatch(rf"(.+?) (?:from|on) (?:the )?({_any(words['from'])})", rest):
         rest, along = found[1], found[2]
     rest = _plain(rest)
     first, _, noun = rest.partition(" ")
+    if noun and (first in words["ordinals"] or re.fullmatch(r"[1-9]\d*(st|nd|rd|th)", first)):
+        nth, rest = words["ordinals"].get(first) or int(first[:-2]), noun
+    place, (first, _, noun) = first, rest.partition(" ")
     if noun and first in words["superlatives"] and not noun.startswith("of "):
         superlative, rest = first, noun
-    elif noun and (first in words["ordinals"] or re.fullmatch(r"\d+(st|nd|rd|th)", first)):
-        nth, rest = words["ordinals"].get(first) or int(first[:-2]), noun
-        if along is None or nth < 1:
-            raise UserError(f"{first} {noun}: say from which side, such as the {first} {noun} from the left")
-    if along is not None and nth is None:
-        raise UserError(f"from the {along}: say which one, such as the second {rest} from the {along}")
     for name in (rest, *([] if without is None else [without])):
         _check_name(name)
-    return Request(rest, False, superlative, nth, along, relation, others, without)
+    if nth and not (along or superlative):
+        raise UserError(f"{place} {rest}: say from which side, such as the {place} {rest} from the left")
+    if along and (superlative or not nth):
+        raise UserError(f"{rest} from the {along}: say which one, such as the second from the {along}")
+    without = without and restored(without)
+    return Request(restored(rest), False, superlative, nth, along, relation, others, without)
 
 
 def _check_name(name: str) -> None:
@@ -136,21 +173,18 @@ def _check_name(name: str) -> None:
     words = table()
     if not name:
         raise UserError("this names no thing: ask for one, such as how many windows")
-    unused = [word for word in name.split() if word in words["unknown"] or word in words["ordinals"]]
-    unused += [word for word in name.split() if word in words["superlatives"]]
-    unused += re.findall(rf"\b(?:{_any(words['relations'])})\b", name)
-    if unused:
-        told = ", ".join(dict.fromkeys(unused))
-        raise UserError(
-            f"{name}: a question can't use {told} here; ask how many windows, for the highest tower, "
-            "the third window from the left, or windows above the portal"
-        )
+    kinds = ("asks", "unknown", "ordinals", "superlatives", "from", "relations")
+    parts = rf"(?<![\w-])(?:{_any(word for kind in kinds for word in words[kind])}|\d\w*)(?![\w-])|[,;]"
+    if unused := re.findall(parts, re.sub(f"{HELD}.*?{HELD}", "", name)):
+        told = f"{name}: a question can't use {', '.join(dict.fromkeys(unused))} here; ask how many windows, "
+        told += "for the highest tower, the third window from the left, or windows above the portal; "
+        raise UserError(told + "quotes hold a phrase")
 
 
 def answer(request: Request, found: Sequence[Things], sight: Facing) -> list[Thing]:
     """Choose the things that a request asks for. `found` holds the things of `Request.words`; `sight` returns
     the directions in which some things are seen. Raises UserError if a thing that the relation refers to is
-    not found, or if there are fewer things than the ordinal asks for."""
+    not found, or if fewer things are found, or seen from there, than the ordinal asks for."""
     things = {one.word: one.things for one in found}
     chosen = list(things[request.word])
     if request.without:
@@ -162,16 +196,42 @@ def answer(request: Request, found: Sequence[Things], sight: Facing) -> list[Thi
         if missing := [other.word for other, there in zip(request.others, others, strict=True) if not there]:
             raise UserError(f"no {missing[0]} found: a relation to it has no answer")
         chosen = [t for t in chosen if _related(t, request.relation, others, view)]
-    if request.superlative:
-        kind, sign = table()["superlatives"][request.superlative]
-        return sorted(chosen, key=lambda thing: sign * measure(thing, kind, view))[:1]
-    if request.nth and request.along:
-        kind, sign = table()["from"][request.along]
-        if len(chosen) < request.nth:
-            raise UserError(f"only {len(chosen)} {request.word} found: there is no number {request.nth}")
-        ordered = sorted(chosen, key=lambda thing: sign * measure(thing, kind, view))
-        return ordered[request.nth - 1 : request.nth]
-    return chosen
+    order = table()["superlatives"].get(request.superlative) or table()["from"].get(request.along)
+    if not order:
+        return chosen
+    (kind, sign), nth, where = order, request.nth or 1, ""
+    if kind == "left" and view.shows and chosen:
+        chosen, where = [thing for thing in chosen if view.shows(thing)], " in this view"
+    if len(chosen) < nth and (request.nth or where):
+        some = f"only {len(chosen)}" if chosen else "none"
+        raise UserError(f"{request.word}: {some} found{where}, so there is no number {nth}")
+    return sorted(chosen, key=lambda thing: sign * measure(thing, kind, view))[nth - 1 : nth]
+
+
+def assumed(request: Request, found: Sequence[Things], sight: Facing) -> str:
+    """Tell which relations refer to any of several things, such as *the portal* where five are found.
+    Arguments are those of `answer`, which answers the request."""
+    several = list[str]()
+    for part in request.parts:
+        pair = part.relation == "between" and len(part.others) == 1
+        counts = [(len(answer(other, found, sight)), other.word) for other in part.others]
+        several += [f"{word}: {n} found, any of them counts" for n, word in counts if n > 1 + pair]
+    return "; ".join(several)
+
+
+def in_words(request: Request, found: Sequence[Things], sight: Facing) -> str:
+    """Answer a request in words: a number, or ids and a photo of each, and what may be wrong with it.
+    Arguments and errors are those of `answer`."""
+    chosen = answer(request, found, sight)
+    if request == Request(request.word, count=True):
+        return found[0].count  # whose range tells how sure it is
+    told = f"{len(chosen)}"
+    if not request.count:
+        listed = some([f"id {one.id} in {one.sightings[0].photo}" for one in chosen])
+        told = f"{told} found: {listed}" if chosen else "none found"
+    doubt = unsure(request, found, sight)
+    notes = assumed(request, found, sight), doubt and f"unsure, since {doubt}"
+    return told + "".join(f" ({note})" for note in notes if note)
 
 
 def unsure(request: Request, found: Sequence[Things], sight: Facing) -> str | None:
@@ -206,10 +266,11 @@ def _close(request: Request, found: Sequence[Things], sight: Facing) -> str | No
     kind, sign = table()["superlatives"].get(request.superlative, ("left", 1))
     if kind in ("left", "top") or _told(request, found, sight) is None:
         return None
-    listed = answer(replace(request, superlative=None), found, sight)
-    view = sight(listed)
-    sizes = sorted((measure(thing, kind, view) for thing in listed), key=lambda size: sign * size)[:2]
-    close = len(sizes) == 2 and max(sizes) < CLOSE * min(sizes)
+    listed = answer(replace(request, superlative=None, nth=None), found, sight)
+    view, nth = sight(listed), request.nth or 1
+    sizes = sorted((measure(thing, kind, view) for thing in listed), key=lambda size: sign * size)
+    next_to = pairwise(sizes[max(nth - 2, 0) : nth + 1])
+    close = any(max(pair) < CLOSE * min(pair) for pair in next_to)
     return f"another {request.word} measures nearly the same" if close else None
 
 

@@ -1,85 +1,113 @@
 // Questions about things: counts, superlatives, ordinals and relations, as in Python's things/grammar.py.
 import { dot } from "./answer.js";
 import language from "./language.js";
+import { held, HELD } from "./vocabulary.js";
 
 const { grammar } = language, { BESIDE, INSIDE, CLOSE, VIEWS, SURE, MISSED } = language.things;
-const has = (table, word) => Object.hasOwn(table, word);
-const any = (phrases) => [...(Array.isArray(phrases) ? phrases : Object.keys(phrases))].sort((a, b) => b.length - a.length).join("|");
+const has = (table, word) => Object.hasOwn(table, word), listed = (phrases) => (Array.isArray(phrases) ? phrases : Object.keys(phrases));
+const any = (...kinds) => kinds.flatMap(listed).sort((a, b) => b.length - a.length).join("|");
 const plain = (text) => text.trim().replace(new RegExp(`^(?:(?:${any(language.articles)})\\s+)+`), "");
 
-/** Parse a question: { word, count, superlative, nth, along, relation, others: what it refers to, without }. Throws an
- * error, which names the part, for what the grammar doesn't know. */
-export function parse(text) {
-  let rest = text.toLowerCase().replace(/^[ ?!.]+|[ ?!.]+$/g, "").split(/\s+/).filter(Boolean).join(" ");
+/** Parse a question: { word, count, superlative, nth, along, relation, others: what it refers to, without }. Quotes hold
+ * a phrase, and so do names, which were taught. Throws an error, which names the part, for what the grammar doesn't know. */
+export function parse(text, names = []) {
+  const { rest, count, restored } = opened(text, names);
+  try {
+    return { ...request(rest, restored), count };
+  } catch (error) {
+    throw new Error(restored(error.message).replaceAll(" :", ":"));
+  }
+}
+
+/** Cut off how a question begins and ends. */
+function opened(text, names) {
+  const { text: typed, restored } = held(text, names);
+  let rest = typed.toLowerCase().replace(/^[ ?!.]+|[ ?!.]+$/g, "").split(/\s+/).filter(Boolean).join(" ");
   const cut = (pattern) => rest !== (rest = rest.replace(pattern, ""));
   const count = cut(new RegExp(`^(?:${any(language.count)})\\s+`));
   cut(new RegExp(`^(?:${any(language.lead)})\\s+`));
   cut(new RegExp(` (?:that |which )?(?:are|is)(?: there)?(?= (?:${any(grammar.relations)}) )| (?:${any(grammar.tail)})$`, "g"));
-  return { ...request(rest), count };
+  return { rest, count, restored };
 }
 
-function request(rest) {
+function request(rest, restored) {
   const asked = { word: "", count: false, superlative: null, nth: null, along: null, relation: null, others: [], without: null };
   let found = /^(.+?) (?:but )?not (.+)$/.exec(rest);
   if (found) [rest, asked.without] = [found[1], plain(found[2])];
   found = new RegExp(`^(.+?) (${any(grammar.relations)}) (.+)$`).exec(rest);
   if (found && !has(grammar.from, plain(found[3]))) {
-    [rest, asked.relation, asked.others] = [found[1], grammar.relations[found[2]], found[3].split(/\s+and\s+/).map(request)];
+    [rest, asked.relation, asked.others] = [found[1], grammar.relations[found[2]], found[3].split(/\s+and\s+/).map((part) => request(part, restored))];
     if (asked.others.length > (asked.relation === "between" ? 2 : 1)) throw new Error(`${found[2]} ${found[3]}: name one thing, or two with between … and …`);
   }
-  found = new RegExp(`^(.+?) (?:from|on) the (${any(grammar.from)})$`).exec(rest);
+  found = new RegExp(`^(.+?) (?:from|on) (?:the )?(${any(grammar.from)})$`).exec(rest);
   if (found) [rest, asked.along] = [found[1], found[2]];
   rest = plain(rest);
-  const [, first, noun] = /^(\S+) (.+)$/.exec(rest) ?? [];
-  if (noun && has(grammar.superlatives, first) && !noun.startsWith("of ")) [asked.superlative, rest] = [first, noun];
-  else if (noun && (has(grammar.ordinals, first) || /^\d+(st|nd|rd|th)$/.test(first))) {
-    [asked.nth, rest] = [grammar.ordinals[first] ?? parseInt(first), noun];
-    if (!asked.along || asked.nth < 1) throw new Error(`${first} ${noun}: say from which side, such as the ${first} ${noun} from the left`);
-  }
-  if (asked.along && !asked.nth) throw new Error(`from the ${asked.along}: say which one, such as the second ${rest} from the ${asked.along}`);
+  const [, place, ordered] = new RegExp(`^(${any(grammar.ordinals)}|[1-9]\\d*(?:st|nd|rd|th)) (.+)$`).exec(rest) ?? [];
+  if (ordered) [asked.nth, rest] = [grammar.ordinals[place] ?? parseInt(place), ordered];
+  const [, superlative, noun] = new RegExp(`^(${any(grammar.superlatives)}) (?!of )(.+)$`).exec(rest) ?? [];
+  if (noun) [asked.superlative, rest] = [superlative, noun];
   for (const name of [rest, ...(asked.without === null ? [] : [asked.without])]) checkName(name);
-  return { ...asked, word: rest };
+  if (asked.nth && !asked.along && !noun) throw new Error(`${place} ${rest}: say from which side, such as the ${place} ${rest} from the left`);
+  if (asked.along && (noun || !asked.nth)) throw new Error(`${rest} from the ${asked.along}: say which one, such as the second from the ${asked.along}`);
+  return { ...asked, word: restored(rest), without: asked.without && restored(asked.without) };
 }
+
+const KINDS = ["asks", "unknown", "ordinals", "superlatives", "from", "relations"].map((kind) => grammar[kind]);
+const wholeWords = (phrases) => `(?<![\\p{L}\\p{N}_-])(?:${phrases})(?![\\p{L}\\p{N}_-])`;
+const UNUSED = new RegExp(`${wholeWords(`${any(...KINDS)}|\\p{N}[\\p{L}\\p{N}_]*`)}|[,;]`, "gu");
 
 function checkName(name) {
   if (!name) throw new Error("this names no thing: ask for one, such as how many windows");
-  const words = name.split(" "), unused = words.filter((word) => grammar.unknown.includes(word) || has(grammar.ordinals, word));
-  unused.push(...words.filter((word) => has(grammar.superlatives, word)), ...(name.match(new RegExp(`\\b(?:${any(grammar.relations)})\\b`, "g")) ?? []));
-  if (!unused.length) return;
+  const unused = name.replace(new RegExp(`${HELD}.*?${HELD}`, "g"), "").match(UNUSED);
+  if (!unused) return;
   throw new Error(`${name}: a question can't use ${[...new Set(unused)].join(", ")} here; ask how many windows, for the highest tower, ` +
-    "the third window from the left, or windows above the portal"); // prettier-ignore
+    "the third window from the left, or windows above the portal; quotes hold a phrase"); // prettier-ignore
 }
 
-/** Whether what was typed asks more than where something is. Quotes hold a phrase. */
-export function isQuestion(text) {
-  if (text.includes('"')) return false;
+const PLACES = listed(grammar.superlatives).filter((word) => !has(grammar.from, word));
+const ASKS = new RegExp(`^(?:${any(grammar.ordinals)}|\\d+(?:st|nd|rd|th)) |${wholeWords(any(grammar.asks, PLACES))}`, "u");
+
+/** Whether what was typed asks more than where something is, perhaps with words that the grammar has no answer to. known:
+ * phrases that hold such words and are none. */
+export function isQuestion(text, names = [], known = []) {
   try {
-    const { count, superlative, nth, relation } = parse(text);
+    const { count, superlative, nth, relation } = parse(text, names);
     return Boolean(count || superlative || nth || relation);
   } catch {
-    return new RegExp(`^(?:${any(language.count)}|how|what|which|why|who|when)\\s`, "i").test(text.trim()); // the grammar says why it has no answer
+    const { rest, count } = opened(text, names);
+    return !known.includes(text.trim().toLowerCase()) && (count || ASKS.test(plain(rest)));
   }
 }
 
 const partsOf = (request) => [request, ...request.others.flatMap(partsOf)];
 export const wordsOf = (request) => [...new Set(partsOf(request).flatMap(({ word, without }) => (without ? [word, without] : [word])))];
 
-/** Choose the things that a request asks for. things: those of each word; view: { right, up, ahead }. Throws an error if
- * a thing that the relation refers to is not found, or if there are fewer than the ordinal asks for. */
+/** Choose the things that a request asks for. things: those of each word; view: { right, up, ahead, shows: tells the
+ * things that one sees, if only those are numbered from left to right }. Throws an error if a thing that the relation
+ * refers to is not found, or if there are fewer than the ordinal asks for. */
 export function answerTo(request, things, view) {
   const { word, relation, others, superlative, nth, along, without } = request;
-  let chosen = things[word];
+  let chosen = things[word], where = "";
   if (without) chosen = chosen.filter(({ id }) => !things[without].some((other) => other.id === id));
   if (relation) {
     const there = others.map((other) => answerTo(other, things, view)), missing = there.findIndex((some) => !some.length);
     if (missing >= 0) throw new Error(`no ${others[missing].word} found: a relation to it has no answer`);
     chosen = chosen.filter((thing) => related(thing, relation, there, view));
   }
-  const ordered = ([kind, sign]) => [...chosen].sort((a, b) => sign * (measure(a, kind, view) - measure(b, kind, view)));
-  if (superlative) return ordered(grammar.superlatives[superlative]).slice(0, 1);
-  if (!nth) return chosen;
-  if (chosen.length < nth) throw new Error(`only ${chosen.length} ${word} found: there is no number ${nth}`);
-  return ordered(grammar.from[along]).slice(nth - 1, nth);
+  const order = grammar.superlatives[superlative] ?? grammar.from[along];
+  if (!order) return chosen;
+  const [kind, sign] = order, place = nth ?? 1;
+  if (kind === "left" && view.shows && chosen.length) [chosen, where] = [chosen.filter(view.shows), " in this view"];
+  if (chosen.length < place && (nth || where)) throw new Error(`${word}: ${chosen.length ? `only ${chosen.length}` : "none"} found${where}, so there is no number ${place}`);
+  return [...chosen].sort((a, b) => sign * (measure(a, kind, view) - measure(b, kind, view))).slice(place - 1, place);
+}
+
+/** Tell which relations refer to any of several things, such as *the portal* where five are found. */
+export function assumed(request, things, view, shown = (word) => word) {
+  return partsOf(request).flatMap(({ relation, others }) => others.flatMap((other) => {
+    const { length } = answerTo(other, things, view);
+    return length > (relation === "between" && others.length === 1 ? 2 : 1) ? [`${shown(other.word)}: ${length} found, any of them counts`] : [];
+  })).join("; "); // prettier-ignore
 }
 
 /** Those of the things that three or more photos show, and over .6 as many as show the typical one. */
@@ -116,8 +144,9 @@ export function unsure(request, found, view, shown = (word) => word) {
   for (const part of plain === null ? [] : partsOf(request)) {
     const [kind, sign] = grammar.superlatives[part.superlative] ?? ["left", 1];
     if (kind === "left" || kind === "top") continue;
-    const sizes = answerTo({ ...part, superlative: null }, of({}), view).map((thing) => measure(thing, kind, view)).sort((a, b) => sign * (a - b));
-    if (sizes.length > 1 && Math.max(sizes[0], sizes[1]) < CLOSE * Math.min(sizes[0], sizes[1])) return `another ${shown(part.word)} measures nearly the same`;
+    const sizes = answerTo({ ...part, superlative: null, nth: null }, of({}), view).map((thing) => measure(thing, kind, view)).sort((a, b) => sign * (a - b));
+    const at = (part.nth ?? 1) - 1, close = (other) => other >= 0 && other < sizes.length && Math.max(sizes[at], sizes[other]) < CLOSE * Math.min(sizes[at], sizes[other]);
+    if (close(at - 1) || close(at + 1)) return `another ${shown(part.word)} measures nearly the same`;
   }
   return null;
 }

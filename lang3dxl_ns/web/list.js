@@ -1,6 +1,6 @@
 // The list of a word's things: how many were found, one after the other, their boxes, and questions about them.
 import { element, say, shown, small } from "./cards.js";
-import { answerTo, count, parse, unsure, wordsOf } from "./grammar.js";
+import { answerTo, assumed, count, parse, unsure, wordsOf } from "./grammar.js";
 import { Vector3 } from "./library.js";
 import { heightAsText, inShares, lengthAsText } from "./measure.js";
 import { advice } from "./vocabulary.js";
@@ -136,36 +136,40 @@ export class List extends EventTarget {
 
   // ── questions ──
 
-  /** Answer a question, such as "highest tower". ask: answers a prompt, and resolves to whether its words are known.
-   * Resolves to the answer in words; null if some word is unknown. */
-  async question(typed, ask) {
-    const request = parse(typed), words = wordsOf(request), found = {};
+  /** Answer a question, such as "highest tower". names: words that were taught; ask: answers a prompt, and resolves to
+   * whether its words are known. Resolves to the answer in words; null if some word is unknown. */
+  async question(typed, names, ask) {
+    const request = parse(typed, names), words = wordsOf(request), found = {};
     for (const word of words) if (!(await ask(word))) return null;
-    const asked = words.map((word) => this.prompts.find(({ text }) => text === word));
+    const asked = words.map((word) => this.prompts.find(({ text }) => text.toLowerCase() === word.toLowerCase()));
     if (!asked.every(Boolean)) return null;
-    for (const prompt of asked) found[prompt.text] = await this.find(prompt);
-    const things = Object.fromEntries(Object.entries(found).map(([word, one]) => [word, one.things]));
-    const view = this.directions, chosen = answerTo(request, things, view), [first] = asked, every = chosen.length === things[request.word].length;
+    for (const [k, word] of words.entries()) found[word] = await this.find(asked[k]);
+    const things = Object.fromEntries(words.map((word) => [word, found[word].things])), own = things[request.word];
+    const view = this.directions, chosen = answerTo(request, things, view), [first] = asked, every = chosen.length === own.length;
     Object.assign(first, { listed: true, asked: every ? null : new Set(chosen.map(({ id }) => id)) });
     const sure = asked.every(({ trust }) => trust.level === "sure" && !trust.far) ? "" : " Not sure: see the cards.";
-    const doubt = request.count && every ? null : unsure(request, found, view, shown);
-    const note = [doubt ? ` Unsure, since ${doubt}.` : "", sure, ...words.flatMap(advice).map((told) => ` But ${told}.`)].join("");
+    const doubt = request.count && every ? null : unsure(request, found, view, shown), several = assumed(request, things, view, shown);
+    const note = [several && ` ${several}.`, doubt ? ` Unsure, since ${doubt}.` : "", sure, ...words.flatMap(advice).map((told) => ` But ${told}.`)].join("");
     if (request.count) {
       this.dispatchEvent(new Event("change"));
       return `${shown(request.word)}: ${every ? count(first.found) : chosen.length}.${note}`; // which suits one and many
     }
     if (chosen.length) this.choose(first, chosen[0]);
     else this.dispatchEvent(new Event("change"));
-    const numbers = chosen.map((thing) => things[request.word].indexOf(thing) + 1).join(", "), name = shown(request.word);
+    const numbers = chosen.map((thing) => own.indexOf(thing) + 1).join(", "), name = shown(request.word);
     if (!chosen.length) return `Found no such ${name}.${note}`;
-    return (chosen.length > MOST_NUMBERS ? `${chosen.length} of ${things[request.word].length} ${name}.` : `${name} ${numbers}.`) + note;
+    return (chosen.length > MOST_NUMBERS ? `${chosen.length} of ${own.length} ${name}.` : `${name} number${chosen.length > 1 ? "s" : ""} ${numbers}.`) + note;
   }
 
-  /** Directions of the viewer: right, up and ahead. */
+  /** Directions of the viewer, right, up and ahead, and whether the middle of a thing lies in the window. */
   get directions() {
-    const up = new Vector3(...this.about.up), ahead = this.view.camera.getWorldDirection(new Vector3());
+    const up = new Vector3(...this.about.up), ahead = this.view.camera.getWorldDirection(new Vector3()), { clientWidth, clientHeight } = this.view.frame;
     ahead.addScaledVector(up, -ahead.dot(up)).normalize();
-    return { right: ahead.clone().cross(up).toArray(), up: up.toArray(), ahead: ahead.toArray() };
+    const shows = ({ center }) => {
+      const [x, y] = this.view.pixel(center) ?? [-1, -1];
+      return x >= 0 && x < clientWidth && y >= 0 && y < clientHeight;
+    };
+    return { right: ahead.clone().cross(up).toArray(), up: up.toArray(), ahead: ahead.toArray(), shows };
   }
 
   // ── boxes and labels ──

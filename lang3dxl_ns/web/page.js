@@ -28,7 +28,7 @@ const think = thinker(
 
 /** Names of the words that this browser keeps. */
 const ownNames = () => kept.words.map(({ name }) => String(name));
-/** Names that hold words such as *and*, which separate prompts elsewhere. */
+/** Names that were taught, which prompts and questions never split. */
 const names = () => [...about.names, ...ownNames()];
 /** Words to offer: own ones, those that the scene answers surely, and all others. */
 const words = () => [...new Set([...ownNames(), ...about.suggested, ...about.known])];
@@ -82,7 +82,7 @@ async function ask(typed, turn = cleared) {
     say("This is in the middle of the view. Click on anything else to learn what it is.");
     return { known: true };
   }
-  if (about.words && isQuestion(String(typed))) return answerQuestion(String(typed));
+  if (about.words && isQuestion(String(typed), names(), about.known)) return answerQuestion(String(typed));
   let found = null;
   for (const { text, negatives } of about.words ? parsePrompts(String(typed), names()) : []) {
     const word = namedWord(text) ?? { text };
@@ -105,7 +105,7 @@ async function ask(typed, turn = cleared) {
 
 /** Answer a question about things, such as "how many windows" or "highest tower". */
 async function answerQuestion(typed) {
-  const told = await list.question(typed, async (word) => (await ask(quoted(word))).known);
+  const told = await list.question(typed, names(), async (word) => (await ask(quoted(word))).known);
   if (told) say(told);
   return { known: told !== null, told };
 }

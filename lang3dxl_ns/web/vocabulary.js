@@ -9,7 +9,7 @@ export const tidy = (text) => text.replace(/["\0]/g, " ").split(/\s+/).filter(Bo
 
 // ── what people type, as in Python's query/language.py; both read query/language.json ──
 
-const HELD = "\ue000"; // stands for a separator that is part of a phrase
+export const HELD = "\ue000"; // surrounds the number of a part that is held
 const longest = (phrases) => [...phrases].sort((a, b) => b.length - a.length).join("|");
 const any = (kind) => longest(language[kind]);
 const literal = (text) => text.replace(/[.*+?^${}()|[\]\\]/g, "\\$&");
@@ -21,15 +21,20 @@ const WHERE = new RegExp(
   `\\s+(?:${any("before_places")})\\s+(?:the\\s+)?(?:${any("places")})(?!${L}).*$` +
   `|^(?:${any("places")}|${any("sizes")})\\s+(?!of(?!${L}))(?=\\S)|\\s+(?:${any("after")})$`, "giu"); // prettier-ignore
 
-/** Parse prompts, each with negatives: `windows and doors; dome not roof`. Quotes protect a phrase; names are never
- * split. */
+/** Put a placeholder, which is one word, in place of every part that quotes hold, and of names: { text, restored: puts
+ * the parts back, without quotes }. */
+export function held(typed, names = []) {
+  const parts = [], whole = wholeOf([...language.one, ...names.map(tidy).filter(Boolean)].map(literal)).source;
+  const plain = typed.replace(/‘([^‘’]*)’|[“”„«»]/g, (_, quoted) => (quoted === undefined ? '"' : `"${quoted}"`));
+  const text = plain.replaceAll(HELD, " ").replace(/[\0\s]+/g, " ").trim().replace(new RegExp(`"[^"]*"|${whole}`, "giu"), (part) => HELD + (parts.push(part) - 1) + HELD);
+  return { text, restored: (some) => tidy(some.replace(new RegExp(`${HELD}(\\d+)${HELD}`, "g"), (_, i) => parts[i])) };
+}
+
+/** Parse prompts, each with negatives: `windows and doors; dome not roof`. Quotes and names are never split. */
 export function parsePrompts(typed, names = []) {
-  const held = [], hold = (text) => HELD + (held.push(text) - 1) + HELD;
-  const plain = typed.replace(/‘([^‘’]*)’|[“”„«»]/g, (_, quoted) => (quoted === undefined ? '"' : `"${quoted}"`)).replace(/[\0\s]+/g, " ").trim();
-  const restored = (text) => tidy(text.replace(new RegExp(`${HELD}(\\d+)${HELD}`, "g"), (_, i) => held[i]));
-  const listed = (text) => text.split(",").flatMap((piece) => piece.split(whole("and"))).filter((part) => part.trim());
-  const parts = plain.replace(/"[^"]*"/g, hold).replace(wholeOf([...language.one, ...names.map(tidy).filter(Boolean)].map(literal)), hold).split(";");
-  return parts
+  const { text, restored } = held(typed, names);
+  const listed = (some) => some.split(",").flatMap((piece) => piece.split(whole("and"))).filter((part) => part.trim());
+  return text.split(";")
     .flatMap((part) => {
       const [wanted, ...others] = part.split(whole("not")), negatives = others.flatMap(listed).map(restored).filter(Boolean);
       const prompts = listed(wanted), alone = prompts.length || negatives.length ? prompts : [part]; // a separator alone

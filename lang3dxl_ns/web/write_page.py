@@ -25,7 +25,7 @@ from lang3dxl_ns.query import view_ranking
 from lang3dxl_ns.query.ask import prompts_of
 from lang3dxl_ns.query.doubt import BEST, DOUBTFUL, DOUBTFUL_TAUGHT, LEAST_PEAK
 from lang3dxl_ns.query.heat_maps import PROMPT_COLORS
-from lang3dxl_ns.query.language import TABLE, phrases_of
+from lang3dxl_ns.query.language import TABLE
 from lang3dxl_ns.query.negatives import CLEAR, NOTHING, competitors
 from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.query.text import NO_SEMANTICS, Prompt, tidy
@@ -231,7 +231,7 @@ class Page:
         about = {
             "words": meaning.description | rules,
             "foreground": _phrases(self._foreground),
-            "names": [name for name in _distinct(named) if phrases_of(name) != [(name, [])]],
+            "names": _distinct(named),
             "suggested": self._suggested(),
             "views": [
                 {"name": n, "bytes": len(packed[n]), **pack.camera_json(seen[n].camera)} for n in views

@@ -5,6 +5,7 @@ from painted_scene import painted_scene
 
 from lang3dxl_ns.commands.things import ListThings
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.words.taught_words import Example
 
 
 @pytest.fixture
@@ -23,7 +24,7 @@ def test_a_count_is_a_number_and_a_list_names_what_it_lists_and_where_it_is_seen
     *words, count, left = ask("How many windows are there?", "leftmost window")[-4:]
     assert [line.split(":")[0] for line in words] == ["windows", "window"]
     assert count.startswith("How many windows are there?: 2")
-    assert left.startswith("leftmost window: 1: ") and " in " in left and ".jpg" in left
+    assert left.startswith("leftmost window: 1 found: id ") and " in " in left and ".jpg" in left
 
 
 def test_what_an_answer_does_not_use_is_told(ask):
@@ -34,4 +35,37 @@ def test_what_an_answer_does_not_use_is_told(ask):
 
 def test_a_word_is_asked_for_too(ask):
     *_, found = ask("is there a dome?")
-    assert found.startswith("is there a dome?: 1: ")
+    assert found.startswith("is there a dome?: 1 found: id ")
+
+
+def test_a_question_without_an_answer_does_not_end_those_that_have_one(ask, tmp_path):
+    *_, count, near, gate = ask(
+        "how many windows", "windows near the dome", "windows above the gate", out=tmp_path
+    )
+    assert count == f"Wrote the things to {tmp_path}" and (tmp_path / "things.json").exists()
+    assert near.startswith("windows near the dome: a question can't use near")
+    assert gate == "windows above the gate: no gate found: a relation to it has no answer"
+    assert "windows above the gate" in ask("windows above the gate", text=["windows"])[-1]
+    with pytest.raises(UserError, match="no gate found"):
+        ask("windows above the gate")
+
+
+def test_quotes_and_taught_names_hold_a_phrase(ask, monkeypatch):
+    assert ask('how many "windows on the dome"')[-1].startswith('how many "windows on the dome": ')
+    scene = painted_scene()
+    taught = scene.teach("Hole in the wall", Example(scene.photos[0].name, points=((48.0, 48.0),)))
+    monkeypatch.setattr("lang3dxl_ns.open_scene.load_scene", lambda *which, **how: taught)
+    word, told = ask("how many hole in the wall")
+    assert word.startswith("hole in the wall: ") and told.startswith("how many hole in the wall: ")
+
+
+def test_texts_with_several_prompts_are_asked_along_with_questions(ask):
+    *words, _ = ask("how many windows", text=["dome; windows"])
+    assert [line.split(":")[0] for line in words if not line.startswith(" ")] == ["dome", "windows"]
+
+
+def test_left_is_told_within_the_photo_that_one_names(ask):
+    name = painted_scene().photos[0].name
+    assert "1 found: id " in ask("leftmost window", view=name)[-1]
+    with pytest.raises(UserError, match="only 2 found in this view"):
+        ask("third window from the left", view=name)

@@ -18,7 +18,7 @@ from lang3dxl_ns.query.trust import FAR
 from lang3dxl_ns.rendering import Camera, Rendering
 from lang3dxl_ns.scene.georeference import Georeference
 from lang3dxl_ns.things.find import PRESENT, Things, axes_of, heights_of, things_of, up_of
-from lang3dxl_ns.things.grammar import Request, Sight, answer, parse, sight_of, table, unsure
+from lang3dxl_ns.things.grammar import Request, Sight, answer, assumed, meant, parse, sight_of, table, unsure
 from lang3dxl_ns.things.join import OFTEN, Joined, grown, join, placed, without_crumbs
 from lang3dxl_ns.things.pieces import Piece, Shown, pieces_of, split
 from lang3dxl_ns.things.thing import Thing, upright_box
@@ -192,10 +192,25 @@ def test_boxes_stand_along_the_walls(angle):
             "windows above the second door from the left",
             Request("windows", relation="above", others=(Request("door", nth=2, along="left"),)),
         ),
+        ("second highest tower", Request("tower", superlative="highest", nth=2)),
+        ("3rd window from left", Request("window", nth=3, along="left")),
+        ('how many "Statue on the roof"', Request("Statue on the roof", count=True)),
+        ("how many “doors and gates” not 'a' door", Request("doors and gates", True, without="'a' door")),
+        ('"top" windows above the "left gate"',
+         Request("top windows", relation="above", others=(Request("left gate"),))),
     ],
-)
+)  # fmt: skip
 def test_questions_are_read(text, request_):
     assert parse(text) == request_
+
+
+@pytest.mark.parametrize("typed", ["statue on the roof", "Statue On the Roof", '"statue on the roof"'])
+def test_taught_names_and_quotes_hold_a_phrase(typed):
+    names, word = ["Statue on the roof", "1"], typed.strip('"')
+    assert parse(f"how many {typed}", names) == Request(word, count=True)
+    assert parse(f"windows above the second {typed} from the left", names).others[0].word == word
+    assert parse(f'"big window" on 1 not {typed}', names).without == word
+    assert parse("statue on the roofs", names).relation == "in"
 
 
 @pytest.mark.parametrize(
@@ -203,11 +218,35 @@ def test_questions_are_read(text, request_):
     [
         *("third window", "windows from the left", "windows between the a and b and c", ""),
         *("left of the door", "windows on the second tower", "windows on"),
+        *("tallest two towers", "top window", "gate 3", "0th window from the left", "doors, towers"),
+        *("third window from the left side", "windows; doors", "two windows above the portal"),
+        *("second highest tower from the left", "windows on the right", "leftmost window from the right"),
     ],
 )
 def test_what_the_grammar_does_not_know_is_said(text):
     with pytest.raises(UserError):
         parse(text)
+
+
+def test_advice_is_a_sentence_whatever_was_typed():
+    def said(text: str) -> str:
+        with pytest.raises(UserError) as told:
+            parse(text)
+        return str(told.value)
+
+    assert said("windows on the right").endswith("such as the second from the right")
+    assert said("3rd window").endswith("such as the 3rd window from the left")
+    assert "can't use from, left" in said("3rd window from the left side")
+    assert said('windows near the "left gate"').startswith(
+        "windows near the left gate: a question can't use near"
+    )
+
+
+def test_a_misspelled_beginning_is_guessed_and_a_word_is_not():
+    assert meant("higest tower") == "highest tower"
+    assert meant("thrid window") == "third window"
+    for name in ("highest", "red tower", "light tower", "rose window", "windows", "tower"):
+        assert meant(name) is None
 
 
 def test_questions_choose_by_place_and_size_and_mirror_with_the_viewer():
@@ -228,8 +267,61 @@ def test_questions_choose_by_place_and_size_and_mirror_with_the_viewer():
     assert ids("portal below the leftmost window") == ids("portal left of the rightmost window") == [9]
     assert ids("portal left of the leftmost window") == []
     assert ids("window left of the right window") == [0, 1, 3]
+    assert ids("second highest window") == ids("second largest window") == [1]  # in their order
     with pytest.raises(UserError, match="only 4"):
         ids("fifth window from the left")
+    with pytest.raises(UserError, match="only 1"):
+        ids("second highest portal")
+
+
+def test_left_and_right_are_told_among_what_the_view_shows():
+    row = [thing(i, "window", (x, 0, 5)) for i, x in enumerate([3, 0, 9, 6])]
+    found, near = [Things("window", row)], replace(SIGHT, shows=lambda one: 1 < one.center[0] < 8)
+
+    def ids(text: str) -> list[int]:
+        return [one.id for one in answer(parse(text), found, lambda _: near)]
+
+    assert (ids("leftmost window"), ids("rightmost window"), ids("second window from the left")) == (
+        [0],
+        [3],
+        [3],
+    )
+    assert ids("window right of the leftmost window") == [2, 3]
+    assert ids("highest window") == ids("first window from the top") == [0]  # wherever one stands
+    for text in ("third window from the left", "third leftmost window"):
+        with pytest.raises(UserError, match="only 2 found in this view"):
+            ids(text)
+    near = replace(SIGHT, shows=lambda one: False)
+    with pytest.raises(UserError, match="none found in this view"):
+        ids("leftmost window")
+
+
+def test_a_photo_shows_what_lies_in_its_frame_before_what_it_sees():
+    scene = painted_scene()
+    windows, photo = scene.things("windows")[0].things, scene.photos[0]
+    assert all(sight_of(scene, windows, photo.name).shows(one) for one in windows)
+    assert sight_of(scene, windows).shows is None
+    shows, eye = sight_of(scene, [], photo.name).shows, photo.camera.position.double().numpy()
+    for times, seen in (
+        (1.0, True),
+        (1.8, False),
+        (-1.0, False),
+    ):  # on the wall, behind it, behind the camera
+        assert shows(replace(windows[0], center=eye + times * (windows[0].center - eye))) is seen
+    assert not shows(replace(windows[0], center=windows[0].center + 99))
+
+
+def test_a_relation_to_several_things_tells_that_any_counts():
+    gates = [thing(i, "gate", (x, 0, 0)) for i, x in enumerate([0, 4, 8])]
+    found = [Things("window", [thing(9, "window", (2, 0, 0))]), Things("gate", gates)]
+
+    def told(text: str, some=found) -> str:
+        return assumed(parse(text), some, lambda _: SIGHT)
+
+    assert told("window left of the gate") == "gate: 3 found, any of them counts"
+    assert told("window left of the leftmost gate") == told("leftmost window") == ""
+    assert told("window between the gates", [found[0], Things("gates", gates)]) != ""
+    assert told("window between the gates", [found[0], Things("gates", gates[:2])]) == ""
 
 
 def test_every_phrase_of_the_table_is_reached():
@@ -414,6 +506,10 @@ def test_an_answer_has_a_caution_if_doubt_would_change_it():
     assert caution("portal below the largest window", windows) is None
     assert caution("portal below the largest window", [*windows, thing(4, "window", (0, 0, 0), (6, 1, 7), 9)])
     assert caution("largest window", [*windows, thing(4, "window", (0, 0, 0), (6, 1, 7), views=9)])
+    assert caution("third largest window", [*windows, thing(4, "window", (0, 0, 0), (6, 1, 7), 9)]) is None
+    assert "nearly" in caution(
+        "second largest window", [*windows, thing(4, "window", (0, 0, 0), (6, 1, 7), 9)]
+    )
     assert caution("highest window", [*windows, thing(4, "window", (0, 0, 0), (6, 1, 7), views=9)]) is None
 
 
