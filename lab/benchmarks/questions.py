@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 from jaxtyping import Float
@@ -23,7 +24,18 @@ NEAR = 0.3
 """Distance, relative to a thing's longest edge, within which its place decides nothing: half of what a thing
 may be off and still count as found. Who is first within it is a tie; what holds on one side of it only may
 be in a list or not."""
-_RELATIONS = ("left of", "right of", "above", "below", "next to", "in front of", "behind")
+_RELATIONS = (
+    "left of",
+    "right of",
+    "above",
+    "below",
+    "next to",
+    "in front of",
+    "behind",
+    "in",
+    "on",
+    "between",
+)
 _PLACES = ("first", "second", "third", "fourth")
 
 
@@ -38,6 +50,8 @@ class Outcome:
     right_if_found: bool
     """Whether it is right about the true things that were found: neither those that were missed count nor
     false ones."""
+    absent: bool = False
+    """Whether it asks for something that is not there, so that none is the right answer."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,6 +63,11 @@ class Known:
     """The true things that the photos show."""
     matches: Mapping[Thing, Thing | None]
     """The true thing of each thing found, if any; None for one that the photos hardly show."""
+
+    @property
+    def is_absent(self) -> bool:
+        """Whether there is no such thing, nor one that the photos hardly show and that was found."""
+        return not self.true and None not in self.matches.values()
 
     @property
     def truth(self) -> Things:
@@ -78,17 +97,30 @@ def _others(words: Sequence[str]) -> Iterator[str]:
         yield from (f"{superlative} {word}" for superlative in table()["superlatives"])
         yield from (f"{nth} {word} from the {side}" for side in table()["from"] for nth in _PLACES)
         yield from (f"{word} {relation} the {o}" for relation in _RELATIONS for o in words if o != word)
+        yield from (f"how many {word} not {o}" for o in words if o != word)
+        pairs = combinations([o for o in words if o != word], 2)
+        yield from (f"{word} between the {a} and the {b}" for a, b in pairs)
+
+
+def absent_questions(absent: Sequence[str], words: Sequence[str]) -> list[str]:
+    """Return questions about things that are not there, alone and in relation to those that `words` name."""
+    alone = [f"{ask} {word}" for word in absent for ask in ("how many", "highest", "largest", "leftmost")]
+    return alone + [f"{word} above the {other}" for other in absent for word in words]
 
 
 def ask_all(scene: Scene, known: Mapping[str, Known]) -> list[Outcome]:
-    """Ask the questions that have a true answer, about words with true things. Left, right and front are
-    those of the photo that shows most of the things found."""
+    """Ask the questions that have a true answer, about words with true things, and questions about words
+    without any. Left, right and front are those of the photo that shows most of the things found."""
+    words = [word for word, one in known.items() if one.true]
+    absent = absent_questions([word for word, one in known.items() if one.is_absent], words)
     outcomes = []
-    for text in questions([word for word, one in known.items() if one.true]):
+    for text in (*questions(words), *absent):
         request = parse(text)
         view = sight_of(scene, known[request.word].found.things)
         truth = _answer(request, [one.truth for one in known.values()], view)
-        if truth is not None and (truth or request.relation):
+        if text in absent:
+            outcomes.append(replace(_outcome(text, request, view, known, truth or []), absent=True))
+        elif truth is not None and (truth or request.relation):
             outcomes.append(_outcome(text, request, view, known, truth))
     return outcomes
 
@@ -99,12 +131,13 @@ def _outcome(
     asked, found = known[request.word], [one.found for one in known.values()]
     given = _answer(request, found, view)
     caution = given is None or any(known[word].found.caution for word in request.words)
-    if request.count:
-        count, least, most = len(asked.found.things), asked.found.least, asked.found.most
-        ranged = least < most and least <= len(truth) <= most
-        return Outcome(text, count == len(truth), caution or ranged, len(asked.seen.things) == len(truth))
-    caution |= unsure(request, found, lambda _: view) is not None
+    doubt = unsure(request, found, lambda _: view) is not None
     true = _answer(request, [one.true_ones for one in known.values()], view)
+    if request.count:  # of one word, perhaps without those of another one: always answered
+        least, most = asked.found.least, asked.found.most
+        caution |= doubt if request.without else least < most and least <= len(truth) <= most
+        return Outcome(text, len(given or []) == len(truth), caution, len(true or []) == len(truth))
+    caution |= doubt
     right = _is_right(request, view, asked, given, [one.truth for one in known.values()])
     right_if_found = _is_right(request, view, asked, true, [one.seen for one in known.values()])
     return Outcome(text, right, caution, right_if_found)
@@ -154,11 +187,18 @@ def _moved(one: Things, step: Float[Array, "3"]) -> Things:
 
 
 def in_words(outcomes: Sequence[Outcome]) -> str:
-    """Summarize the shares of right answers, and of wrong ones that came without a caution."""
-    right, found = (np.mean([getattr(o, name) for o in outcomes]) for name in ("right", "right_if_found"))
+    """Summarize the shares of right answers, and of wrong ones that came without a caution, and apart those
+    about what is not there."""
+    there, absent = ([o for o in outcomes if o.absent is kind] for kind in (False, True))
+    found = np.mean([o.right_if_found for o in there])
+    told = f"{_shares(there, f'right, {found:.0%} about the things that were found')}"
+    return f"{told}; about what is not there: {_shares(absent, 'right')}" if absent else told
+
+
+def _shares(outcomes: Sequence[Outcome], name: str) -> str:
     bold = np.mean([not o.right and not o.cautious for o in outcomes])
     timid = np.mean([o.cautious for o in outcomes if o.right] or [False])
     return (
-        f"{len(outcomes)} questions: {right:.0%} right, {found:.0%} about the things that were found, "
+        f"{len(outcomes)} questions: {np.mean([o.right for o in outcomes]):.0%} {name}, "
         f"{bold:.0%} wrong without a caution, {timid:.0%} of the right ones with one"
     )

@@ -114,10 +114,6 @@ class Score:
     """The same, against boxes of the Gaussians that photos show on the true things."""
 
     @property
-    def f1(self) -> float:
-        return 2 * self.found / max(self.seen + self.found + self.false, 1)
-
-    @property
     def off(self) -> float:
         """Relative error of the count."""
         return abs(self.count[0] - self.seen) / max(self.seen, 1)
@@ -211,12 +207,20 @@ def box_iou(a: Thing | TrueThing, b: Thing | TrueThing) -> float:
     return float(shared / max(volumes.sum() - shared, 1e-30))
 
 
-def _summary(word: str, rows: Sequence[Score]) -> list[str]:
-    there, false = [row for row in rows if row.seen], sum(row.false for row in rows)
+def pooled_f1(rows: Sequence[Score]) -> float | None:
+    """Compute F1 over the things of all scenes, and so with false ones where none is true; None without any
+    things."""
+    seen, found, false = (sum(getattr(row, name) for row in rows) for name in ("seen", "found", "false"))
+    return 2 * found / (seen + found + false) if seen + false else None
+
+
+def _summary(word: str, rows: Sequence[Score]) -> list[str | None]:
+    there, f1 = [row for row in rows if row.seen], pooled_f1(rows)
+    sums = [str(sum(getattr(row, name) for row in rows)) for name in ("seen", "found", "false")]
+    told = None if f1 is None else f"{f1:.2f}"
     if not there:
-        return [word, "0", "", str(false), *[""] * 5]
+        return [word, *sums, told, *[None] * 4]
     ious, marked = ([iou for row in there for iou in getattr(row, name)] for name in ("ious", "marked_ious"))
     in_range = np.mean([row.count[1] <= row.seen <= row.count[2] for row in there])
-    return [word, str(sum(row.seen for row in there)), str(sum(row.found for row in there)), str(false),
-            f"{np.mean([row.f1 for row in there]):.2f}", f"{np.median([row.off for row in there]):.0%}",
-            f"{in_range:.0%}", *(f"{np.mean(iou):.2f}" if iou else "" for iou in (ious, marked))]  # fmt: skip
+    return [word, *sums, told, f"{np.median([row.off for row in there]):.0%}", f"{in_range:.0%}",
+            *(f"{np.mean(iou):.2f}" if iou else None for iou in (ious, marked))]  # fmt: skip

@@ -10,7 +10,8 @@ import pytest
 import torch
 from painted_scene import painted_file, painted_scene
 
-from lab.benchmarks.questions import Known, ask_all
+from lab.benchmarks.questions import Known, ask_all, in_words, questions
+from lab.benchmarks.things import Score, pooled_f1
 from lab.landmark.instances import true_things
 from lab.landmark.landmark import Landmark
 from lang3dxl_ns.common.errors import UserError
@@ -281,11 +282,8 @@ def test_left_and_right_are_told_among_what_the_view_shows():
     def ids(text: str) -> list[int]:
         return [one.id for one in answer(parse(text), found, lambda _: near)]
 
-    assert (ids("leftmost window"), ids("rightmost window"), ids("second window from the left")) == (
-        [0],
-        [3],
-        [3],
-    )
+    assert ids("leftmost window") == ids("second window from the right") == [0]
+    assert ids("rightmost window") == ids("second window from the left") == [3]
     assert ids("window right of the leftmost window") == [2, 3]
     assert ids("highest window") == ids("first window from the top") == [0]  # wherever one stands
     for text in ("third window from the left", "third leftmost window"):
@@ -302,13 +300,13 @@ def test_a_photo_shows_what_lies_in_its_frame_before_what_it_sees():
     assert all(sight_of(scene, windows, photo.name).shows(one) for one in windows)
     assert sight_of(scene, windows).shows is None
     shows, eye = sight_of(scene, [], photo.name).shows, photo.camera.position.double().numpy()
-    for times, seen in (
-        (1.0, True),
-        (1.8, False),
-        (-1.0, False),
-    ):  # on the wall, behind it, behind the camera
-        assert shows(replace(windows[0], center=eye + times * (windows[0].center - eye))) is seen
-    assert not shows(replace(windows[0], center=windows[0].center + 99))
+    elsewhere = replace(windows[0], sightings=[])
+    # On the wall, behind it, and behind the camera.
+    for times, seen in ((1.0, True), (1.8, False), (-1.0, False)):
+        place = eye + times * (elsewhere.center - eye)
+        assert shows(replace(elsewhere, center=place)) is seen
+        assert shows(replace(windows[0], center=place))  # this photo has found it
+    assert not shows(replace(elsewhere, center=elsewhere.center + 99))
 
 
 def test_a_relation_to_several_things_tells_that_any_counts():
@@ -463,6 +461,39 @@ def test_generated_questions_are_right_where_all_is_found_and_tell_what_is_misse
     # Where the one that was missed is a candidate, no answer that it would change comes without a caution.
     assert all(one.cautious for one in some if not one.right)
     assert sum(one.cautious for one in some if one.right) < sum(one.right for one in some) / 2
+
+
+def test_generated_questions_use_every_relation_and_ask_for_what_is_not_there():
+    asked = [parse(text) for text in questions(["window", "portal", "tower"])]
+    assert {one.relation for one in asked} == {None, *table()["relations"].values()}
+    assert any(one.without for one in asked) and any(len(one.others) == 2 for one in asked)
+    true, spire = (
+        [thing(i, "window", (i, 0, 5), views=9) for i in range(3)],
+        thing(8, "spire", (9, 0, 9), views=9),
+    )
+
+    def absent(*spires: Thing):
+        known = {
+            "window": Known(Things("window", true), true, {one: one for one in true}),
+            "spire": Known(Things("spire", list(spires)), [], {}),
+        }
+        outcomes = ask_all(painted_scene(), known)
+        assert "0 questions" not in in_words(outcomes)
+        return [one for one in outcomes if one.absent], in_words(outcomes)
+
+    right, told = absent()
+    assert len(right) > 3 and all(one.right for one in right)
+    assert f"not there: {len(right)} questions: 100% right" in told
+    wrong, told = absent(spire)
+    assert not any(one.right or one.cautious for one in wrong)
+    assert f"not there: {len(wrong)} questions: 0% right, 100% wrong without a caution" in told
+
+
+def test_false_things_count_where_a_word_has_no_true_one():
+    counted = (9, 9, 9), ()
+    rows = [Score("mosque", "minarets", 9, 9, 0, *counted), Score("hall", "minarets", 0, 0, 4, *counted)]
+    assert pooled_f1(rows) == pytest.approx(18 / 22)
+    assert pooled_f1(rows[:1]) == 1 and pooled_f1(rows[1:]) == 0 and pooled_f1([]) is None
 
 
 SIZES = ("tallest", "shortest", "largest", "biggest", "smallest", "widest", "narrowest")
