@@ -35,7 +35,7 @@ class ListThings(OfScene):
 
     def main(self) -> None:
         from lang3dxl_ns.open_scene import load_scene
-        from lang3dxl_ns.query.ask import prompts_of
+        from lang3dxl_ns.query.ask import Text, prompts_of
         from lang3dxl_ns.query.text import Prompt, caution
         from lang3dxl_ns.things.grammar import in_words, meant, parse, sight_of
         from lang3dxl_ns.things.write import write_catalog, write_picture, write_things
@@ -50,8 +50,9 @@ class ListThings(OfScene):
         for text in self.ask:
             with _noted(text, refused):
                 asked[text] = parse(text, scene.words)
-        wanted = [*self.text, *(Prompt(word) for request in asked.values() for word in request.words)]
-        prompts = list(dict.fromkeys(prompts_of(scene, wanted) if wanted else ()))
+        texts: list[Text] = list(self.text)
+        texts += (Prompt(word) for request in asked.values() for word in request.words)
+        prompts = list(dict.fromkeys(prompts_of(scene, texts) if texts else ()))
         answers = scene.things(prompts) if prompts else []
         by_word = {p.text: one for p, one in zip(prompts, answers, strict=True) if not p.negatives}
         for prompt, one in zip(prompts, answers, strict=True):

@@ -14,13 +14,14 @@ from lang3dxl_ns.common.errors import UserError, readable
 from lang3dxl_ns.common.files import read_json
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth
 from lang3dxl_ns.query.scene import Scene
+from lang3dxl_ns.query.text import Prompt
 from lang3dxl_ns.things.write import coco
 
 
-def score_things(scene: Scene, path: Path) -> list[tuple[str, int, int, int, float]]:
+def score_things(scene: Scene, path: Path) -> list[tuple[str, int, int, int, float | None]]:
     """Compare the things of each category of a COCO file, or of a folder of LERF-OVS labels, with its boxes,
     in the photos that it names. Return for each word the number of boxes there, found (intersection over
-    union of at least a half) and false, and F1. Raises UserError for other files."""
+    union of at least a half) and false, and F1 (None without any box). Raises UserError for other files."""
     sizes = {photo.name: photo.file_size for photo in scene.photos}
     if path.is_dir():
         labels = GroundTruth(path, "lerf_ovs")
@@ -28,6 +29,8 @@ def score_things(scene: Scene, path: Path) -> list[tuple[str, int, int, int, flo
         words, names = labels.categories, {name for name in sizes if labels.key(name)}
         marked = ((n, word, one) for n in names for word, one in labels.truths(n, sizes[n][::-1]).items())
         true = {(n, word): (np.array(one.boxes) / (2 * sizes[n])).tolist() for n, word, one in marked}
+    elif not path.exists():
+        raise UserError(f"there is no {path}: name a COCO file, or a folder of LERF-OVS labels")
     else:
         with readable(f"{path} holds no COCO instances", "export the boxes from the labeling tool as COCO"):
             content = read_json(path)
@@ -35,12 +38,13 @@ def score_things(scene: Scene, path: Path) -> list[tuple[str, int, int, int, flo
             names = {image["file_name"] for image in content["images"]} & sizes.keys()
     if not names or not words:
         raise UserError(f"{path} names no photo of this scene: file_name must be {scene.photos[0].name}, …")
-    given, scores = _boxes(coco(scene, scene.things(words))), []
+    given, scores = _boxes(coco(scene, scene.things([Prompt(word) for word in words]))), []
     for word in words:
         sides = [[np.array(of.get((n, word), [])).reshape(-1, 4) for of in (true, given)] for n in names]
         there, listed = (sum(len(side[i]) for side in sides) for i in (0, 1))
         found = sum(_matches(*side) for side in sides)
-        scores.append((word, there, found, listed - found, round(2 * found / max(there + listed, 1), 3)))
+        f1 = round(2 * found / (there + listed), 3) if there + listed else None
+        scores.append((word, there, found, listed - found, f1))
     return scores
 
 

@@ -23,8 +23,8 @@ from lang3dxl_ns.common.files import read_json
 from lang3dxl_ns.query.language import HELD, TABLE, held
 from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.query.vocabulary import closest_word, common_words
-from lang3dxl_ns.rendering import Camera
 from lang3dxl_ns.scene.camera import in_camera_frame
+from lang3dxl_ns.scene.record import ScenePhoto
 from lang3dxl_ns.things.find import MISSED, Things, up_of
 from lang3dxl_ns.things.thing import Thing
 
@@ -92,18 +92,20 @@ def sight_of(scene: Scene, things: list[Thing], photo: str | None = None) -> Sig
     ahead = -np.array(shown.camera_to_world)[:, 2]
     ahead = ahead - up * (ahead @ up)
     ahead /= max(np.linalg.norm(ahead), 1e-9)
-    return Sight(np.cross(ahead, up), up, ahead, None if photo is None else _shown_by(scene, shown.camera))
+    return Sight(np.cross(ahead, up), up, ahead, None if photo is None else _shown_by(scene, shown))
 
 
-def _shown_by(scene: Scene, camera: Camera) -> Callable[[Thing], bool]:
-    """Tell the things whose middle lies in a camera's frame, at most their width behind what it sees."""
+def _shown_by(scene: Scene, photo: ScenePhoto) -> Callable[[Thing], bool]:
+    """Tell the things that were found in a photo, or whose middle it shows: held-out photos find none."""
+    camera = photo.camera
     depth, lens = scene.draw(camera).depth.cpu().numpy(), camera.intrinsics.cpu().numpy()
 
     def shows(thing: Thing) -> bool:
         (seen,) = in_camera_frame(camera, torch.from_numpy(thing.center[None])).cpu().numpy()
         x, y = (lens[:2] @ seen / max(seen[2], 1e-9)).astype(int)
         inside = seen[2] > 0 and 0 <= x < camera.width and 0 <= y < camera.height
-        return bool(inside and seen[2] < depth[y, x] + thing.size[:2].max())
+        ahead = bool(inside and seen[2] < depth[y, x] + thing.size[:2].max())
+        return ahead or any(sighting.photo == photo.name for sighting in thing.sightings)
 
     return shows
 

@@ -33,6 +33,20 @@ def test_own_boxes_score_full_marks_in_any_size_and_each_is_found_once(tmp_path)
     assert found < count and false == count - found
 
 
+def test_a_category_is_one_word_and_has_no_score_without_any_box(tmp_path):
+    scene, file = painted_scene(), tmp_path / "labels.json"
+    content = coco(scene, scene.things("windows"))
+    count = len(content["annotations"])
+    content["categories"][0]["name"] = "windows, all of them"
+    content["categories"].append({"id": 9, "name": "nothing of the kind"})
+    file.write_text(json.dumps(content))
+    whole, nothing = score_things(scene, file)
+    assert whole == ("windows, all of them", count, count, 0, 1.0)
+    assert nothing == ("nothing of the kind", 0, 0, 0, None)
+    with pytest.raises(UserError, match=r"there is no .*missing\.json"):
+        score_things(scene, tmp_path / "missing.json")
+
+
 def test_labels_of_lerf_ovs_score_as_the_same_boxes_in_coco(tmp_path):
     scene, file, folder = painted_scene(), tmp_path / "labels.json", tmp_path / "labels"
     content = coco(scene, scene.things("windows"))
