@@ -45,7 +45,8 @@ class ListThings(OfScene):
         if self.splats and self.out is None:
             raise UserError("--splats writes files: give --out too")
         scene = load_scene(self.scene, clip=self.clip)
-        seen = None if self.view is None else sight_of(scene, [], self.view)
+        if self.view is not None:
+            scene.file.photo(self.view)
         asked, refused = {}, list[str]()
         for text in self.ask:
             with _noted(text, refused):
@@ -61,6 +62,8 @@ class ListThings(OfScene):
                 other = meant(one.word, scene.words)
                 advice = caution(one.word), other and f"did you mean {other}?"
                 say(*(f"  {line}" for line in advice if line))
+        every = [thing for one in answers for thing in (*one.things, *one.candidates)]
+        seen = None if self.view is None else sight_of(scene, every, self.view)
         for text, request in asked.items():
             with _noted(text, refused):
                 found = [by_word[word] for word in request.words]

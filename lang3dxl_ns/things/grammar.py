@@ -78,36 +78,35 @@ class Sight:
     right: Float[Array, "3"]
     up: Float[Array, "3"]
     ahead: Float[Array, "3"]
-    shows: Callable[[Thing], bool] | None = None
-    """Tells which things one sees: the order from left to right is theirs; None: all."""
+    shown: frozenset[int] | None = None
+    """Ids of the things that one sees: the order from left to right is theirs; None: all."""
 
 
 def sight_of(scene: Scene, things: list[Thing], photo: str | None = None) -> Sight:
-    """Return the directions of a photo's viewer, and what the photo shows; by default of the photo that shows
-    most of the things, and all things."""
+    """Return the directions of a photo's viewer, and which of the things it shows; by default of the photo
+    that shows most of them, as if it showed all."""
     names = [sighting.photo for thing in things for sighting in thing.sightings]
     best = max(sorted(set(names)), key=names.count) if names else scene.overview.name
-    shown = scene.file.photo(best if photo is None else photo)
+    taken = scene.file.photo(best if photo is None else photo)
     up = up_of(scene)
-    ahead = -np.array(shown.camera_to_world)[:, 2]
+    ahead = -np.array(taken.camera_to_world)[:, 2]
     ahead = ahead - up * (ahead @ up)
     ahead /= max(np.linalg.norm(ahead), 1e-9)
-    return Sight(np.cross(ahead, up), up, ahead, None if photo is None else _shown_by(scene, shown))
+    return Sight(np.cross(ahead, up), up, ahead, None if photo is None else _shown(scene, taken, things))
 
 
-def _shown_by(scene: Scene, photo: ScenePhoto) -> Callable[[Thing], bool]:
-    """Tell the things that were found in a photo, or whose middle it shows: held-out photos find none."""
+def _shown(scene: Scene, photo: ScenePhoto, things: list[Thing]) -> frozenset[int]:
+    """List the things that were found in a photo, or whose middle it shows: held-out photos find none."""
     camera = photo.camera
     depth, lens = scene.draw(camera).depth.cpu().numpy(), camera.intrinsics.cpu().numpy()
-
-    def shows(thing: Thing) -> bool:
+    shown = {thing.id for thing in things for seen in thing.sightings if seen.photo == photo.name}
+    for thing in things:
         (seen,) = in_camera_frame(camera, torch.from_numpy(thing.center[None])).cpu().numpy()
         x, y = (lens[:2] @ seen / max(seen[2], 1e-9)).astype(int)
         inside = seen[2] > 0 and 0 <= x < camera.width and 0 <= y < camera.height
-        ahead = bool(inside and seen[2] < depth[y, x] + thing.size[:2].max())
-        return ahead or any(sighting.photo == photo.name for sighting in thing.sightings)
-
-    return shows
+        if inside and seen[2] < depth[y, x] + thing.size[:2].max():
+            shown.add(thing.id)
+    return frozenset(shown)
 
 
 Facing = Callable[[list[Thing]], Sight]
@@ -202,8 +201,8 @@ def answer(request: Request, found: Sequence[Things], sight: Facing) -> list[Thi
     if not order:
         return chosen
     (kind, sign), nth, where = order, request.nth or 1, ""
-    if kind == "left" and view.shows and chosen:
-        chosen, where = [thing for thing in chosen if view.shows(thing)], " in this view"
+    if kind == "left" and view.shown is not None and chosen:
+        chosen, where = [thing for thing in chosen if thing.id in view.shown], " in this view"
     if len(chosen) < nth and (request.nth or where):
         some = f"only {len(chosen)}" if chosen else "none"
         raise UserError(f"{request.word}: {some} found{where}, so there is no number {nth}")

@@ -82,8 +82,8 @@ export function isQuestion(text, names = [], known = []) {
 const partsOf = (request) => [request, ...request.others.flatMap(partsOf)];
 export const wordsOf = (request) => [...new Set(partsOf(request).flatMap(({ word, without }) => (without ? [word, without] : [word])))];
 
-/** Choose the things that a request asks for. things: those of each word; view: { right, up, ahead, shows: tells the
- * things that one sees, if only those are numbered from left to right }. Throws an error if a thing that the relation
+/** Choose the things that a request asks for. things: those of each word; view: { right, up, ahead, shown: ids of the
+ * things that one sees, which alone are numbered from left to right; none: all }. Throws an error if a thing that the relation
  * refers to is not found, or if there are fewer than the ordinal asks for. */
 export function answerTo(request, things, view) {
   const { word, relation, others, superlative, nth, along, without } = request;
@@ -97,7 +97,7 @@ export function answerTo(request, things, view) {
   const order = grammar.superlatives[superlative] ?? grammar.from[along];
   if (!order) return chosen;
   const [kind, sign] = order, place = nth ?? 1;
-  if (kind === "left" && view.shows && chosen.length) [chosen, where] = [chosen.filter(view.shows), " in this view"];
+  if (kind === "left" && view.shown && chosen.length) [chosen, where] = [chosen.filter(({ id }) => view.shown.has(id)), " in this view"];
   if (chosen.length < place && (nth || where)) throw new Error(`${word}: ${chosen.length ? `only ${chosen.length}` : "none"} found${where}, so there is no number ${place}`);
   return [...chosen].sort((a, b) => sign * (measure(a, kind, view) - measure(b, kind, view))).slice(place - 1, place);
 }

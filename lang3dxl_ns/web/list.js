@@ -145,7 +145,7 @@ export class List extends EventTarget {
     if (!asked.every(Boolean)) return null;
     for (const [k, word] of words.entries()) found[word] = await this.find(asked[k]);
     const things = Object.fromEntries(words.map((word) => [word, found[word].things])), own = things[request.word];
-    const view = this.directions, chosen = answerTo(request, things, view), [first] = asked, every = chosen.length === own.length;
+    const view = this.sight(Object.values(found)), chosen = answerTo(request, things, view), [first] = asked, every = chosen.length === own.length;
     Object.assign(first, { listed: true, asked: every ? null : new Set(chosen.map(({ id }) => id)) });
     const sure = asked.every(({ trust }) => trust.level === "sure" && !trust.far) ? "" : " Not sure: see the cards.";
     const doubt = request.count && every ? null : unsure(request, found, view, shown), several = assumed(request, things, view, shown);
@@ -161,15 +161,13 @@ export class List extends EventTarget {
     return (chosen.length > MOST_NUMBERS ? `${chosen.length} of ${own.length} ${name}.` : `${name} number${chosen.length > 1 ? "s" : ""} ${numbers}.`) + note;
   }
 
-  /** Directions of the viewer, right, up and ahead, and whether the middle of a thing lies in the window. */
-  get directions() {
+  /** Directions of the viewer, right, up and ahead, and the ids of the things whose middle lies in the window. */
+  sight(found) {
     const up = new Vector3(...this.about.up), ahead = this.view.camera.getWorldDirection(new Vector3()), { clientWidth, clientHeight } = this.view.frame;
     ahead.addScaledVector(up, -ahead.dot(up)).normalize();
-    const shows = ({ center }) => {
-      const [x, y] = this.view.pixel(center) ?? [-1, -1];
-      return x >= 0 && x < clientWidth && y >= 0 && y < clientHeight;
-    };
-    return { right: ahead.clone().cross(up).toArray(), up: up.toArray(), ahead: ahead.toArray(), shows };
+    const inside = ([x, y]) => x >= 0 && x < clientWidth && y >= 0 && y < clientHeight, every = found.flatMap(({ things, candidates }) => [...things, ...candidates]);
+    const shown = new Set(every.filter(({ center }) => inside(this.view.pixel(center) ?? [-1, -1])).map(({ id }) => id));
+    return { right: ahead.clone().cross(up).toArray(), up: up.toArray(), ahead: ahead.toArray(), shown };
   }
 
   // ── boxes and labels ──

@@ -277,7 +277,7 @@ def test_questions_choose_by_place_and_size_and_mirror_with_the_viewer():
 
 def test_left_and_right_are_told_among_what_the_view_shows():
     row = [thing(i, "window", (x, 0, 5)) for i, x in enumerate([3, 0, 9, 6])]
-    found, near = [Things("window", row)], replace(SIGHT, shows=lambda one: 1 < one.center[0] < 8)
+    found, near = [Things("window", row)], replace(SIGHT, shown=frozenset({0, 3}))
 
     def ids(text: str) -> list[int]:
         return [one.id for one in answer(parse(text), found, lambda _: near)]
@@ -289,7 +289,7 @@ def test_left_and_right_are_told_among_what_the_view_shows():
     for text in ("third window from the left", "third leftmost window"):
         with pytest.raises(UserError, match="only 2 found in this view"):
             ids(text)
-    near = replace(SIGHT, shows=lambda one: False)
+    near = replace(SIGHT, shown=frozenset())
     with pytest.raises(UserError, match="none found in this view"):
         ids("leftmost window")
 
@@ -297,10 +297,13 @@ def test_left_and_right_are_told_among_what_the_view_shows():
 def test_a_photo_shows_what_lies_in_its_frame_before_what_it_sees():
     scene = painted_scene()
     windows, photo = scene.things("windows")[0].things, scene.photos[0]
-    assert all(sight_of(scene, windows, photo.name).shows(one) for one in windows)
-    assert sight_of(scene, windows).shows is None
-    shows, eye = sight_of(scene, [], photo.name).shows, photo.camera.position.double().numpy()
-    elsewhere = replace(windows[0], sightings=[])
+    assert sight_of(scene, windows, photo.name).shown == {one.id for one in windows}
+    assert sight_of(scene, windows).shown is None
+    eye, elsewhere = photo.camera.position.double().numpy(), replace(windows[0], sightings=[])
+
+    def shows(one: Thing) -> bool:
+        return one.id in sight_of(scene, [one], photo.name).shown
+
     # On the wall, behind it, and behind the camera.
     for times, seen in ((1.0, True), (1.8, False), (-1.0, False)):
         place = eye + times * (elsewhere.center - eye)

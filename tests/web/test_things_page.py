@@ -160,16 +160,16 @@ def test_questions_choose_the_things_that_python_chooses_and_are_as_unsure(page)
     assert 5 < sum(doubt is None for _, doubt, _ in answers) < len(ASKED) - 5
     assert 5 < sum(not any_of for *_, any_of in answers) < len(ASKED) - 5
     # Where a view shows a part of the things, left and right are told among these.
-    seen = replace(SIGHT, shows=lambda thing: thing.center[0] > 4)
-    body = """const { found, view, asked } = given, shows = ({ center }) => center[0] > 4;
+    seen = replace(SIGHT, shown=frozenset(t.id for one in found for t in one.things if t.center[0] > 4))
+    body = """const { found, asked } = given, view = { ...given.view, shown: new Set(given.shown) };
       const things = Object.fromEntries(Object.entries(found).map(([word, one]) => [word, one.things]));
       return asked.map((text) => {
-        try { return m.answerTo(m.parse(text), things, { ...view, shows }).map(({ id }) => id); }
+        try { return m.answerTo(m.parse(text), things, view).map(({ id }) => id); }
         catch (error) { return error.message; }
       });"""
     asked = [*ASKED, "leftmost window", "second window from the left", "eighth window from the left"]
-    answers = module(page, "grammar", body, {"asked": asked, "found": given, "view": view})
-    assert answers == [chosen_or_error(text, found, seen) for text in asked]
+    given = {"asked": asked, "found": given, "view": view, "shown": [*seen.shown]}
+    assert module(page, "grammar", body, given) == [chosen_or_error(text, found, seen) for text in asked]
 
 
 def chosen_or_error(text: str, found: list[Things], view: Sight) -> list[int] | str:
