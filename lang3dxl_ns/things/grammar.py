@@ -149,7 +149,7 @@ def _request(rest: str, restored: Callable[[str], str]) -> Request:
         others = tuple(_request(part, restored) for part in re.split(r"\s+and\s+", found[3]))
         if len(others) > (2 if relation == "between" else 1):
             raise UserError(f"{found[2]} {found[3]}: name one thing, or two with between … and …")
-    along, nth, superlative = None, None, None
+    along, nth, superlative, whole = None, None, None, rest
     if found := re.fullmatch(rf"(.+?) (?:from|on) (?:the )?({_any(words['from'])})", rest):
         rest, along = found[1], found[2]
     rest = _plain(rest)
@@ -164,7 +164,7 @@ def _request(rest: str, restored: Callable[[str], str]) -> Request:
     if nth and not (along or superlative):
         raise UserError(f"{place} {rest}: say from which side, such as the {place} {rest} from the left")
     if along and (superlative or not nth):
-        raise UserError(f"{rest} from the {along}: say which one, such as the second from the {along}")
+        raise UserError(f"{whole}: say which one, such as the second from the {along}")
     without = without and restored(without)
     return Request(restored(rest), False, superlative, nth, along, relation, others, without)
 

@@ -39,6 +39,7 @@ function request(rest, restored) {
     [rest, asked.relation, asked.others] = [found[1], grammar.relations[found[2]], found[3].split(/\s+and\s+/).map((part) => request(part, restored))];
     if (asked.others.length > (asked.relation === "between" ? 2 : 1)) throw new Error(`${found[2]} ${found[3]}: name one thing, or two with between … and …`);
   }
+  const whole = rest;
   found = new RegExp(`^(.+?) (?:from|on) (?:the )?(${any(grammar.from)})$`).exec(rest);
   if (found) [rest, asked.along] = [found[1], found[2]];
   rest = plain(rest);
@@ -48,7 +49,7 @@ function request(rest, restored) {
   if (noun) [asked.superlative, rest] = [superlative, noun];
   for (const name of [rest, ...(asked.without === null ? [] : [asked.without])]) checkName(name);
   if (asked.nth && !asked.along && !noun) throw new Error(`${place} ${rest}: say from which side, such as the ${place} ${rest} from the left`);
-  if (asked.along && (noun || !asked.nth)) throw new Error(`${rest} from the ${asked.along}: say which one, such as the second from the ${asked.along}`);
+  if (asked.along && (noun || !asked.nth)) throw new Error(`${whole}: say which one, such as the second from the ${asked.along}`);
   return { ...asked, word: restored(rest), without: asked.without && restored(asked.without) };
 }
 

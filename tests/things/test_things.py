@@ -235,7 +235,10 @@ def test_advice_is_a_sentence_whatever_was_typed():
             parse(text)
         return str(told.value)
 
-    assert said("windows on the right").endswith("such as the second from the right")
+    assert (
+        said("windows on the right")
+        == "windows on the right: say which one, such as the second from the right"
+    )
     assert said("3rd window").endswith("such as the 3rd window from the left")
     assert "can't use from, left" in said("3rd window from the left side")
     assert said('windows near the "left gate"').startswith(

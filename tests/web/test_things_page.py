@@ -22,6 +22,7 @@ from lang3dxl_ns.things.pieces import LEVELS, Piece, split
 from lang3dxl_ns.things.thing import Thing, upright_box
 from lang3dxl_ns.web.pack import camera_json, splat_bytes
 from lang3dxl_ns.web.write_page import Page, write_page
+from lang3dxl_ns.words.taught_words import Example
 
 QUESTIONS = [
     *("the big door on the left", "third window on the left"),
@@ -358,11 +359,14 @@ def test_questions_typed_into_the_page_are_answered_or_refused(page):
     until(page, "lang3dxl.view.only", None)
 
 
-def test_counts_in_a_strange_scene_have_a_caution(browser, tmp_path):
+def test_counts_in_a_strange_scene_have_a_caution_and_taught_names_are_whole(browser, tmp_path):
     strange = painted_scene()
     strange.__dict__.update(foreignness=FAR)
-    write_page(Page(strange), tmp_path)
+    mark = Example(strange.photos[0].name, points=((48.0, 48.0),))
+    write_page(Page(strange.teach("Hole in the wall", mark)), tmp_path)
     with served(tmp_path) as address:
         page = opened(browser, address, DESK)
         told = page.evaluate("lang3dxl.ask('how many windows').then(({ told }) => told)")
+        taught = page.evaluate("lang3dxl.ask('how many hole in the wall').then(({ told }) => told)")
     assert told.startswith("windows: 2") and "Not sure" in told
+    assert taught.startswith("hole in the wall: ")
