@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -47,12 +46,10 @@ class ListThings(OfScene):
         scene = load_scene(self.scene, clip=self.clip)
         if self.view is not None:
             scene.file.photo(self.view)
-        asked, refused = {}, list[str]()
-        for text in self.ask:
-            with _noted(text, refused):
-                asked[text] = parse(text, scene.words)
         texts: list[Text] = list(self.text)
-        texts += (Prompt(word) for request in asked.values() for word in request.words)
+        for text in self.ask:
+            with suppress(UserError):  # which is told below
+                texts += map(Prompt, parse(text, scene.words).words)
         prompts = list(dict.fromkeys(prompts_of(scene, texts) if texts else ()))
         answers = scene.things(prompts) if prompts else []
         by_word = {p.text: one for p, one in zip(prompts, answers, strict=True) if not p.negatives}
@@ -64,10 +61,14 @@ class ListThings(OfScene):
                 say(*(f"  {line}" for line in advice if line))
         every = [thing for one in answers for thing in (*one.things, *one.candidates)]
         seen = None if self.view is None else sight_of(scene, every, self.view)
-        for text, request in asked.items():
-            with _noted(text, refused):
+        refused = []
+        for text in dict.fromkeys(self.ask):
+            try:
+                request = parse(text, scene.words)
                 found = [by_word[word] for word in request.words]
                 say(f"{text}: {in_words(request, found, lambda things: seen or sight_of(scene, things))}")
+            except UserError as error:
+                refused.append(str(error) if str(error).startswith(text) else f"{text}: {error}")
         if self.out is not None and answers:
             write_catalog(scene, answers, self.out)
             write_picture(scene, answers, self.out / "things.png")
@@ -77,12 +78,3 @@ class ListThings(OfScene):
         if not self.text and len(refused) == len({*self.ask}):
             raise UserError("; ".join(refused))
         say(*refused)
-
-
-@contextmanager
-def _noted(text: str, refused: list[str]) -> Iterator[None]:
-    """Note why a question has no answer, and go on with the next one."""
-    try:
-        yield
-    except UserError as error:
-        refused.append(f"{text}: {error}" if not str(error).startswith(text) else str(error))
