@@ -37,7 +37,13 @@ class ListThings(OfScene):
         from lang3dxl_ns.query.ask import Text, prompts_of
         from lang3dxl_ns.query.text import Prompt, caution
         from lang3dxl_ns.things.grammar import in_words, meant, parse, sight_of
-        from lang3dxl_ns.things.write import write_catalog, write_picture, write_things
+        from lang3dxl_ns.things.write import (
+            each_word_once,
+            printed,
+            write_catalog,
+            write_picture,
+            write_things,
+        )
 
         if not (self.text or self.ask):
             raise UserError("give --text or --ask: say which things to look for, such as --text windows")
@@ -59,6 +65,10 @@ class ListThings(OfScene):
                 other = meant(one.word, scene.words)
                 advice = caution(one.word), other and f"did you mean {other}?"
                 say(*(f"  {line}" for line in advice if line))
+        own = set(prompts_of(scene, self.text)) if self.text else set()
+        named = [one for prompt, one in zip(prompts, answers, strict=True) if prompt in own]
+        if any(one.things for one in named):
+            say(*printed(scene, each_word_once(named)))
         every = [thing for one in answers for thing in (*one.things, *one.candidates)]
         seen = None if self.view is None else sight_of(scene, every, self.view)
         refused = []
@@ -70,10 +80,11 @@ class ListThings(OfScene):
             except UserError as error:
                 refused.append(str(error) if str(error).startswith(text) else f"{text}: {error}")
         if self.out is not None and answers:
-            write_catalog(scene, answers, self.out)
-            write_picture(scene, answers, self.out / "things.png")
+            listed = each_word_once(answers)
+            write_catalog(scene, listed, self.out)
+            write_picture(scene, listed, self.out / "things.png")
             if self.splats:
-                write_things(scene, answers, self.out / "splats")
+                write_things(scene, listed, self.out / "splats")
             say(f"Wrote the things to {self.out}")
         if not self.text and len(refused) == len({*self.ask}):
             raise UserError("; ".join(refused))

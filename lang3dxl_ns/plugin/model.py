@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from nerfstudio.cameras.camera_optimizers import CameraOptimizer, CameraOptimizerConfig
 from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.utils.colors import get_color
+from numpy import ndarray as Array
 from torch import Tensor
 from torch.nn import Parameter
 from torch.optim import Optimizer
@@ -29,8 +30,6 @@ from lang3dxl_ns.plugin.splatfacto import SplatfactoModel, SplatfactoModelConfig
 from lang3dxl_ns.preparation.targets import FACTS, Batch, SceneFacts, foreground
 from lang3dxl_ns.query.question import Question, pictures
 from lang3dxl_ns.rendering import Rendering
-from lang3dxl_ns.things.find import Things
-from lang3dxl_ns.things.write import outlined
 from lang3dxl_ns.training.conversation import Conversation
 from lang3dxl_ns.training.parts import CameraRefinement
 from lang3dxl_ns.training.settings import TrainingSettings
@@ -58,8 +57,8 @@ class RenderedAnswers:
     """The outputs that `ns-render` adds to every rendering, as a viewer's `Conversation` does."""
 
     question: Question
-    things: Sequence[Things] = ()
-    """Things whose outlines are drawn; none unless a command asks for them, since finding them takes time."""
+    outlined: Callable[[Rendering], UInt8[Array, "h w 3"]] | None = None
+    """Draws outlines of things; None unless a command asks for them, since finding them takes time."""
     shows_bottleneck: bool = True
 
     def channels(self) -> Tensor:
@@ -69,8 +68,8 @@ class RenderedAnswers:
     def outputs(self, rendering: Rendering, seconds: float) -> dict[str, Tensor]:
         """Return the outputs that answer the question, and the things' numbered outlines."""
         outputs = pictures(rendering, self.question)
-        if self.things:
-            outputs["things"] = torch.tensor(outlined(rendering, self.things) / 255.0).to(rendering.rgb)
+        if self.outlined:
+            outputs["things"] = torch.tensor(self.outlined(rendering) / 255.0).to(rendering.rgb)
         return outputs
 
 

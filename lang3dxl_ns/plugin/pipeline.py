@@ -6,7 +6,7 @@ import os
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -27,6 +27,7 @@ from lang3dxl_ns.plugin.model import Lang3DXLModel, Lang3DXLModelConfig, Rendere
 from lang3dxl_ns.plugin.panel import AskPanel
 from lang3dxl_ns.scene.record import SCENE_FILE, SceneRecord
 from lang3dxl_ns.things.find import things_of
+from lang3dxl_ns.things.outlines import outlined
 from lang3dxl_ns.training.learn_codes import begin_codes, learn_words
 from lang3dxl_ns.training.snapshot import snapshot
 
@@ -113,7 +114,8 @@ class Lang3DXLPipeline(VanillaPipeline):
             question = scene.ask(self.query)
             # ns-render doesn't tell a model which outputs it wants, and finding things takes a while.
             things = things_of(scene, question) if "things" in sys.argv else []
-            self.model.answers = RenderedAnswers(question, things)
+            draw = partial(outlined, scene.splats, things) if things else None
+            self.model.answers = RenderedAnswers(question, draw)
 
     def learn_words(self) -> None:
         """Gather the training photos' features onto the present Gaussians, and learn codes."""

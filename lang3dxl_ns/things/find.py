@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator
+from dataclasses import dataclass, field
 from functools import partial
-from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch
@@ -32,8 +31,6 @@ PAIRED, NEIGHBORS = 1_000, 3.0
 distance, relative to the gap between groups."""
 HEIGHTS = 0.01, 0.9995
 """Shares of a landmark's Gaussians that lie below the ground, and below its top."""
-_KNOWN: WeakKeyDictionary[Answering, list[Thing]] = WeakKeyDictionary()
-"""Things that were found in each scene so far: they keep their ids."""
 SURE = 0.6
 """Number of views, relative to the typical thing's, above which a thing is sure."""
 MISSED = 1.4
@@ -42,8 +39,6 @@ hold on six of eight validation landmarks."""
 PRESENT = 0.9
 """Relevancy that a thing's best Gaussian reaches; one that stays below it is a candidate. On eight validation
 landmarks 8 of 511 true things stay below (all windows), and 25 of 74 false ones."""
-SAME = 0.5
-"""Overlap (intersection over union of weights) from which two words' things are one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,6 +47,7 @@ class Things:
 
     word: str
     things: list[Thing]
+    """The heaviest first; its place in this list is a thing's number."""
     candidates: list[Thing] = field(default_factory=list)
     """Further things, perhaps: those that a single photo shows, and small ones."""
     caution: str | None = None
@@ -85,7 +81,7 @@ def things_of(scene: Answering, question: Question) -> list[Things]:
 
     Every training view's heat map falls into pieces (`pieces_of`), and pieces of several views are one thing
     where they share Gaussians (`join`). Where a prompt's colors (in the page's light) differ from the others,
-    they separate neighbors: the wall between two windows that CLIP sees as one. Things keep their ids later.
+    they separate neighbors: the wall between two windows that CLIP sees as one.
     """
     mass = scene.mass.double().cpu().numpy()
     means, axes = scene.splats.means.double().cpu().numpy(), axes_of(scene)
@@ -100,19 +96,19 @@ def things_of(scene: Answering, question: Question) -> list[Things]:
     def box(weight: Float[Array, " n"], one: Joined) -> Box:
         return upright_box(means[one.rows], weight[one.rows], axes)
 
-    answers, known = list[Things](), _KNOWN.setdefault(scene, [])
+    answers = list[Things]()
     for i, prompt in enumerate(question.prompts):
         values = question.relevancy[i].double().cpu().numpy()
         weight = np.sqrt(mass) * values
         boxed = partial(box, weight)
         parts = grown(join(pieces[i], weight, boxed), len(weight))
-        joined = placed(parts, [boxed(part) for part in parts])
+        joined = sorted(placed(parts, [boxed(part) for part in parts]), key=lambda one: -one.weight)
         seen = (one for one in without_crumbs(joined) if one.views >= VIEWS)
         sure = [one for one in seen if prompt.taught or values[one.rows].max() >= PRESENT]
-        listed = [_known(_thing(prompt.text, one, boxed(one), mass, values), known, mass)
-                  for one in [*sure, *(one for one in joined if one not in sure)]]  # fmt: skip
-        things, candidates = listed[: len(sure)], listed[len(sure) :]
-        known += [thing for thing in things if all(thing.id != other.id for other in known)]
+        rest = [one for one in joined if one not in sure]
+        things, candidates = (
+            [_thing(prompt.text, one, boxed(one), mass, values) for one in some] for some in (sure, rest)
+        )
         trust, far = question.trusts[i], (scene.foreignness or 0) >= FAR and prompt.taught is None
         caution = trust.reason if far or trust.level != "sure" else None
         answers.append(Things(prompt.text, things, candidates, caution))
@@ -206,13 +202,6 @@ def _thing(
         best.setdefault(piece.photo, piece)
     score = float(np.average(relevancy[rows], weights=np.maximum(mass[rows], 1e-9)))
     sightings = [Sighting(name, piece.box) for name, piece in best.items()]
-    return Thing(int(rows[mass[rows].argmax()]), word, score, one.views, *box, rows, sightings)
-
-
-def _known(thing: Thing, known: Sequence[Thing], mass: Float[Array, " n"]) -> Thing:
-    """Give a thing the id of one that another word found at the same place."""
-    for other in known:
-        shared = mass[np.intersect1d(thing.rows, other.rows)].sum()
-        if shared > SAME * mass[np.union1d(thing.rows, other.rows)].sum():
-            return replace(thing, id=other.id)
-    return thing
+    shown = np.bincount(np.concatenate([piece.rows for piece in one.votes]), minlength=len(mass))
+    strongest = (mass * shown * relevancy**2)[rows].argmax()
+    return Thing(int(rows[strongest]), word, score, one.views, *box, rows, sightings)

@@ -30,7 +30,8 @@ class Thing:
     """One thing: a window, a portal, a tower."""
 
     id: int
-    """Index of its heaviest Gaussian, by which it is known whatever it is asked by."""
+    """Index of its strongest Gaussian: one that is large, matches, and that many of its pieces show. So other
+    words that find the same thing give it the same id, and nothing that was asked before changes it."""
     word: str
     """Prompt that found it."""
     score: float
@@ -48,16 +49,20 @@ class Thing:
     sightings: list[Sighting] = field(default_factory=list)
     """Photos that show it, the best first."""
 
+    @property
+    def best_photo(self) -> str:
+        """Name of the photo that shows it best; empty if no photo does."""
+        return self.sightings[0].photo if self.sightings else ""
+
     def __repr__(self) -> str:
         where, size = (tuple(v.round(3).tolist()) for v in (self.center, self.size))
         return f"Thing({self.id}, {self.word!r}, center {where}, size {size}, score {self.score:.2f})"
 
     def as_json(self) -> dict[str, Any]:
-        """Return its description, without its Gaussians, for JSON."""
-        seen = [{"photo": s.photo, "box": list(s.box)} for s in self.sightings]
+        """Return its description, without its Gaussians and photos, for JSON."""
         numbers = {name: getattr(self, name).round(5).tolist() for name in ("center", "axes", "size")}
         return {"id": self.id, "word": self.word, "score": round(self.score, 3), "views": self.views,
-                **numbers, "gaussians": len(self.rows), "photos": seen}  # fmt: skip
+                **numbers, "gaussians": len(self.rows)}  # fmt: skip
 
 
 def upright_box(points: Float[Array, "m 3"], weight: Float[Array, " m"], axes: Float[Array, "3 3"]) -> Box:

@@ -1,4 +1,4 @@
-"""Files of things: a catalog with relations, a table, COCO instances, numbered outlines, and splats."""
+"""Files of things: a catalog with relations, a table, COCO labels, numbered outlines, and splats."""
 
 from __future__ import annotations
 
@@ -7,61 +7,84 @@ import io
 import json
 from collections.abc import Sequence
 from dataclasses import asdict
-from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import UInt8
-from numpy import ndarray as Array
-from PIL import Image, ImageDraw
-from scipy.spatial import ConvexHull
+from PIL import Image
+from scipy.ndimage import find_objects
 
 from lang3dxl_ns.common.files import make_folder, slugs, write_atomically
+from lang3dxl_ns.files.coco import CocoLabels
 from lang3dxl_ns.files.glb import encode_glb
 from lang3dxl_ns.files.splat_file import write_splats
-from lang3dxl_ns.query.heat_maps import PROMPT_COLORS
-from lang3dxl_ns.query.match import as_bytes, save_picture
+from lang3dxl_ns.query.match import save_picture
+from lang3dxl_ns.query.negatives import singulars
 from lang3dxl_ns.query.scene import Scene
-from lang3dxl_ns.rendering import Rendering
-from lang3dxl_ns.scene.camera import in_camera_frame
 from lang3dxl_ns.things.find import Things, heights_of, up_of
 from lang3dxl_ns.things.grammar import Sight, holds, sight_of
+from lang3dxl_ns.things.outlines import held, numbered, outlined
+from lang3dxl_ns.things.pieces import LEAST
 from lang3dxl_ns.things.thing import Thing
 
 SIDES = {"left": "left_of", "right": "right_of", "above": "above", "below": "below"}
 SIDES |= {"front": "in_front_of", "behind": "behind"}
 """Names in the catalog of the relations between neighbors."""
-_CORNERS = np.array(list(product((-0.5, 0.5), repeat=3)))
+COLUMNS = (
+    *("number", "word", "id", "score", "views", "x", "y", "z", "width", "depth", "height"),
+    *("photo", "width_m", "depth_m", "height_m"),
+)
+"""Columns of things.csv: center and size in world units, the best photo, and the size in meters if known."""
+
+
+def each_word_once(answers: Sequence[Things]) -> list[Things]:
+    """Leave out words that an earlier one is the plural or singular of: they name the same things."""
+    forms = [{*singulars(one.word.lower())} for one in answers]
+    return [one for k, one in enumerate(answers) if not any(forms[k] & other for other in forms[:k])]
+
+
+def printed(scene: Scene, answers: Sequence[Things]) -> list[str]:
+    """Format a table of things: number, word, id, size, score and the photo that shows it best."""
+    place = scene.file.georeference
+    unit, scale = ("units", 1.0) if place is None else ("m", place.meters)
+    rows = [("number", "word", "id", f"width × depth × height, {unit}", "score", "best photo")]
+    for _, number, thing in numbered(answers):
+        size = " × ".join(f"{side:.3g}" for side in scale * thing.size)
+        rows.append((str(number), thing.word, str(thing.id), size, f"{thing.score:.2f}", thing.best_photo))
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return ["  ".join(map(str.ljust, row, widths)).rstrip() for row in rows]
 
 
 def write_catalog(scene: Scene, answers: Sequence[Things], folder: Path) -> None:
     """Write things.json (boxes, sizes, scores, photos, and the scene graph: what is in what, and neighbors),
-    things.csv and instances.json (COCO boxes in all photos)."""
+    things.csv and instances.json (COCO labels of all photos)."""
     make_folder(folder)
-    things = _each_once(answers)
+    things, place, up = [thing for _, _, thing in numbered(answers)], scene.file.georeference, up_of(scene)
     graph = _relations(things, sight_of(scene, things))
     words = [{"word": one.word, "count": len(one.things), "least": one.least, "most": one.most,
               "caution": one.caution, "things": [thing.id for thing in one.things]}
              for one in answers]  # fmt: skip
-    place = scene.file.georeference
-    meters = [None if place is None else (place.meters * t.size).round(2).tolist() for t in things]
-    listed = [t.as_json() | {"meters": size} for t, size in zip(things, meters, strict=True)]
-    (ground, top), up = heights_of(scene).tolist(), up_of(scene)
+    ground, top = heights_of(scene).tolist()
     unit = 1 / max(top - ground, 1e-9) if place is None else place.meters
-    for thing, told in zip(things, listed, strict=True):
-        told["above_ground"] = round(unit * (float(thing.center @ up) - ground), 3)
+    sizes = {one.name: np.divide(one.file_size, (one.lens.width, one.lens.height)) for one in scene.photos}
+    zooms = {name: np.tile(zoom, 2) for name, zoom in sizes.items()}
+    rows, listed = io.StringIO(), []
+    table = csv.writer(rows, lineterminator="\n")
+    table.writerow(COLUMNS)
+    for _, number, thing in numbered(answers):
+        meters = None if place is None else (place.meters * thing.size).round(2).tolist()
+        above = round(unit * (float(thing.center @ up) - ground), 3)
+        boxes = [np.rint(one.box * zooms[one.photo]).astype(int).tolist() for one in thing.sightings]
+        seen = [{"photo": one.photo, "box": box} for one, box in zip(thing.sightings, boxes, strict=True)]
+        more = {"meters": meters, "above_ground": above, "photos": seen}
+        listed.append({"number": number, **thing.as_json(), **more})
+        told = number, thing.word, thing.id, round(thing.score, 3), thing.views
+        box = *thing.center.round(4).tolist(), *thing.size.round(4).tolist()
+        table.writerow([*told, *box, thing.best_photo, *(meters or [""] * 3)])
     content = {"words": words, "things": listed, "relations": graph, "heights": [ground, top]}
     content |= {"up": up.tolist(), "unit": None if place is None else asdict(place)}
     write_atomically(folder / "things.json", json.dumps(content, indent=1) + "\n")
-    rows = io.StringIO()
-    rows.write("id,word,score,views,x,y,z,width,depth,height,photo,width_m,depth_m,height_m\n")
-    table = csv.writer(rows, lineterminator="\n")
-    for thing, size in zip(things, meters, strict=True):
-        seen = thing.sightings[0].photo if thing.sightings else ""
-        numbers = [*thing.center.round(4).tolist(), *thing.size.round(4).tolist(), seen, *(size or [""] * 3)]
-        table.writerow([thing.id, thing.word, round(thing.score, 3), thing.views, *numbers])
     write_atomically(folder / "things.csv", rows.getvalue())
     write_atomically(folder / "instances.json", json.dumps(coco(scene, answers)) + "\n")
 
@@ -82,69 +105,44 @@ def _relations(things: Sequence[Thing], view: Sight) -> list[list[int | str]]:
 
 
 def coco(scene: Scene, answers: Sequence[Things]) -> dict[str, Any]:
-    """Return the boxes of all things in all photos that show them, as COCO instances."""
-    numbers = {photo.name: i + 1 for i, photo in enumerate(scene.photos)}
-    images = [{"id": numbers[photo.name], "file_name": photo.name, "width": photo.camera.width,
-               "height": photo.camera.height} for photo in scene.photos]  # fmt: skip
-    categories = [{"id": i + 1, "name": one.word} for i, one in enumerate(answers)]
-    boxes = [(i + 1, thing, sighting) for i, one in enumerate(answers) for thing in one.things
-             for sighting in thing.sightings]  # fmt: skip
-    labels = []
-    for number, (category, thing, sighting) in enumerate(boxes, 1):
-        left, top, right, bottom = sighting.box
-        size = right - left, bottom - top
-        labels.append({"id": number, "image_id": numbers[sighting.photo], "category_id": category,
-                       "bbox": [left, top, *size], "area": size[0] * size[1], "iscrowd": 0,
-                       "score": round(thing.score, 3), "thing": thing.id})  # fmt: skip
-    return {"images": images, "categories": categories, "annotations": labels}
+    """Label all things in all photos that show six pixels of them, in pixels of the photos' files, as COCO's
+    content."""
+    labels = CocoLabels([one.word for one in answers])
+    for photo in scene.photos:
+        labels.add_photo(photo.name, photo.file_size)
+        for category, one in enumerate(answers, start=1):
+            numbers = held(scene.splats, photo.camera, one.things)
+            zoom = np.divide(photo.file_size[::-1], numbers.shape)
+            places = find_objects(numbers, len(one.things))
+            for number, (thing, place) in enumerate(zip(one.things, places, strict=True), start=1):
+                if place is None or (mask := numbers[place] == number).sum() < LEAST:
+                    continue
+                ends = np.array([(side.start, side.stop) for side in place])
+                (top, left), (bottom, right) = np.rint(zoom * ends.T).astype(int).tolist()
+                part = Image.fromarray(mask).resize((right - left, bottom - top), Image.Resampling.NEAREST)
+                where, told = (slice(top, bottom), slice(left, right)), {"thing": thing.id}
+                labels.add_label(category, np.asarray(part), where, **told, score=round(thing.score, 3))
+    return labels.content
 
 
 def write_picture(scene: Scene, answers: Sequence[Things], path: Path) -> None:
     """Draw numbered outlines on the rendering of the photo that shows most of the things."""
-    names = [shown.photo for one in answers for thing in one.things for shown in thing.sightings]
+    names = [shown.photo for _, _, thing in numbered(answers) for shown in thing.sightings]
     if names:
         photo = max(sorted(set(names)), key=names.count)
         camera = scene.file.photo(photo).camera
         view = scene.render(photo, 2 * max(camera.width, camera.height))
-        save_picture(outlined(view.rendering, answers), path)
-
-
-def outlined(rendering: Rendering, answers: Sequence[Things]) -> UInt8[Array, "h w 3"]:
-    """Draw each thing's box in its word's color, numbered, unless it lies over its size behind the view."""
-    picture, camera = Image.fromarray(as_bytes(rendering.rgb)), rendering.camera
-    pen, lens, depth = ImageDraw.Draw(picture), camera.intrinsics.cpu().numpy(), rendering.depth.cpu().numpy()
-    numbered = [(i, n, thing) for i, one in enumerate(answers) for n, thing in enumerate(one.things, 1)]
-    for which, number, thing in numbered:
-        places = np.vstack([thing.center, thing.center + (_CORNERS * thing.size) @ thing.axes])
-        seen = in_camera_frame(camera, torch.from_numpy(places)).cpu().numpy()
-        if seen[:, 2].min() < 1e-2 * thing.size.max():
-            continue  # beside the camera or behind it
-        pixels = (seen / seen[:, 2:]) @ lens[:2].T
-        x, y = pixels[0].astype(int)
-        inside = 0 <= x < camera.width and 0 <= y < camera.height
-        if inside and seen[0, 2] < depth[y, x] + thing.size.max():
-            around = pixels[1:][ConvexHull(pixels[1:], qhull_options="QJ").vertices]
-            color = PROMPT_COLORS[which % len(PROMPT_COLORS)]
-            pen.polygon(around.ravel().tolist(), outline=color, width=2)
-            pen.text((x, y), str(number), color, anchor="mm", stroke_width=1, stroke_fill="white")
-    return np.asarray(picture)
+        save_picture(outlined(scene.splats, answers, view.rendering), path)
 
 
 def write_things(scene: Scene, answers: Sequence[Things], folder: Path, look: str | None = None) -> int:
     """Write a splat file for each thing, named by word and id, and scene.glb with the ids of all as features;
     return how many things were written."""
     make_folder(folder)
-    baked, things = scene.baked(look), _each_once(answers)
+    baked, things = scene.baked(look), [thing for _, _, thing in numbered(answers)]
     write_atomically(folder / "scene.glb", encode_glb(baked, things=things, place=scene.file.georeference))
     words = dict(zip((one.word for one in answers), slugs([one.word for one in answers]), strict=True))
     for thing in things:
         rows = torch.from_numpy(np.sort(thing.rows)).to(scene.device)
         write_splats(folder / f"{words[thing.word]}-{thing.id}.ply", baked.select(rows))
     return len(things)
-
-
-def _each_once(answers: Sequence[Things]) -> list[Thing]:
-    first: dict[int, Thing] = {}
-    for thing in (thing for one in answers for thing in one.things):
-        first.setdefault(thing.id, thing)
-    return list(first.values())

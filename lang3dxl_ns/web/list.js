@@ -15,7 +15,7 @@ export class List extends EventTarget {
    * the list, or what is chosen in it, has changed. */
   constructor(about, think, view, prompts) {
     super();
-    Object.assign(this, { about, think, view, prompts, chosen: null, wanted: null });
+    Object.assign(this, { about, think, view, prompts, chosen: null, wanted: null, visible: new Set() });
   }
 
   /** Find a prompt's things, once for each of its answers; resolves to { things, candidates }. */
@@ -60,7 +60,7 @@ export class List extends EventTarget {
 
   /** Choose a thing, and fly to it. */
   choose(prompt, thing) {
-    const photo = this.about.views[thing.seen[0]?.view];
+    const photo = this.about.views[thing.seen[0]];
     if (photo) {
       const { position } = this.view.mover.standing(photo), target = new Vector3(...thing.center), size = Math.max(...thing.size);
       const fov = (360 / Math.PI) * Math.atan(size / FILLED / 2 / Math.max(position.distanceTo(target), 1e-6));
@@ -113,7 +113,7 @@ export class List extends EventTarget {
 
   /** Choose the thing that shows these Gaussians, among the lists that are open; returns whether there is one. */
   pick(rows) {
-    for (const prompt of this.prompts.filter(({ listed, found }) => listed && found)) {
+    for (const prompt of this.open) {
       const thing = prompt.found.things.find((one) => rows.some((row) => one.rows.includes(row)));
       if (thing) return this.choose(prompt, thing), true;
     }
@@ -172,11 +172,28 @@ export class List extends EventTarget {
 
   // ── boxes and labels ──
 
-  /** Draw the boxes of the lists that are open, with numbers that don't overlap; the chosen one comes first. */
+  /** The prompts whose lists are open. */
+  get open() {
+    return this.prompts.filter(({ listed, found }) => listed && found);
+  }
+
+  /** Find which things the view shows. Resolves to whether it is still the same view. */
+  async look() {
+    const turn = (this.turn = {}), lists = this.open.map(({ found }) => found.things);
+    const found = lists.length ? await this.think("shown", { camera: this.view.picking, lists: lists.map((things) => things.map(({ rows }) => rows)) }) : [];
+    if (turn === this.turn) this.visible = new Set(lists.flatMap((things, k) => things.filter((_, t) => found[k][t])));
+    return turn === this.turn;
+  }
+
+  /** Draw the boxes of the lists that are open, with numbers that don't overlap: of what the view shows, and of the chosen
+   * thing, which comes first and is alone where the rest is hidden. */
   outlines() {
     const drawn = [], taken = [];
-    for (const prompt of this.prompts.filter(({ listed, found }) => listed && found)) {
-      prompt.found.things.forEach((thing, k) => drawn.push({ prompt, thing, label: `${k + 1}`, own: thing === this.chosen?.thing, asked: !prompt.asked || prompt.asked.has(thing.id) }));
+    for (const prompt of this.open) {
+      prompt.found.things.forEach((thing, k) => {
+        const own = thing === this.chosen?.thing, asked = !prompt.asked || prompt.asked.has(thing.id);
+        if (own || (this.visible.has(thing) && !this.view.only)) drawn.push({ prompt, thing, label: `${k + 1}`, own, asked });
+      });
     }
     return drawn.sort((a, b) => b.own - a.own || b.asked - a.asked).flatMap((one) => this.outline(one, taken));
   }

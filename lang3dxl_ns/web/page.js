@@ -162,6 +162,7 @@ function draw(newest = null) {
   view.recolor(prompts.filter((prompt) => prompt.relevancy));
   newest?.card.scrollIntoView({ block: "nearest" });
   drawBoxes();
+  attempt(drawShown);
   keepAddress();
 }
 
@@ -169,6 +170,9 @@ function drawBoxes() {
   drawScale(about, view);
   $("boxes").replaceChildren(...list.outlines());
 }
+
+/** Draw the boxes of what this view shows. */
+const drawShown = async () => (await list.look()) && drawBoxes();
 
 function fly(prompt) {
   const views = prompt.views.filter((one) => one.shown);
@@ -489,7 +493,7 @@ function listen() {
   view.addEventListener("moved", () => {
     drawBoxes();
     clearTimeout(moving);
-    moving = setTimeout(keepAddress, 300);
+    moving = setTimeout(() => (keepAddress(), attempt(drawShown)), 300);
   });
   view.mover.addEventListener("far", () => (($("here").hidden = true), keepAddress(true))); // what is told of a place is of this view
   view.mover.addEventListener("walks", () => ($("walk").ariaPressed = String(view.mover.walking)));

@@ -29,37 +29,39 @@ function rotation(axis, angle) {
     t * x * z + s * y, t * y * z - s * x, c + t * z * z]; // prettier-ignore
 }
 
-/** Return the Gaussians that pixel x, y shows: [row, weight, center]. geometries: of the scene's parts, whose rows count
- * from `first` on; camera: a view as of find.js, in their frame. */
-export function gaussiansAt(geometries, camera, x, y, antialiased) {
-  const hits = geometries.flatMap((geometry) => hitsOf(geometry, camera, x, y, antialiased));
-  let clear = 1;
-  return hits.sort((a, b) => a[0] - b[0]).map(([, row, alpha, center]) => {
-    const weight = clear * alpha;
-    clear -= weight;
-    return [row, weight, center];
+/** Return for each pixel [x, y] the Gaussians that it shows: [row, weight, center]. geometries: of the scene's parts, whose
+ * rows count from `first` on; camera: a view as of find.js, in their frame. */
+export function gaussiansAt(geometries, camera, pixels, antialiased) {
+  const hits = pixels.map(() => []);
+  for (const geometry of geometries) addHits(hits, geometry, camera, pixels, antialiased);
+  return hits.map((found) => {
+    let clear = 1;
+    return found.sort((a, b) => a[0] - b[0]).map(([, row, alpha, center]) => {
+      const weight = clear * alpha;
+      clear -= weight;
+      return [row, weight, center];
+    });
   });
 }
 
-/** List what a pixel shows of one part: [depth, row, opacity, center]. */
-function hitsOf({ centers, axes, opacities, first = 0 }, camera, x, y, antialiased) {
-  const hits = [];
+/** Add what pixels show of one part: [depth, row, opacity, center]. */
+function addHits(hits, { centers, axes, opacities, first = 0 }, camera, pixels, antialiased) {
   for (let i = 0; i < opacities.length; i++) {
-    const center = centers.subarray(3 * i, 3 * i + 3), place = seenAt(camera, center), depth = place[2];
+    const center = centers.subarray(3 * i, 3 * i + 3), place = seenAt(camera, center), [x, y, depth] = place;
     if (depth <= 0.01 || opacities[i] < 1 / 255) continue;
-    const du = x - place[0], dv = y - place[1];
-    let reach = 0;
+    let reach = 0, spread = null;
     for (let k = 0; k < 9; k++) reach = Math.max(reach, Math.abs(axes[9 * i + k]));
-    if (Math.max(Math.abs(du), Math.abs(dv)) > 2 + (8 * camera.fx * reach) / depth) continue;
-    let [uu, uv, vv] = spreadAt(camera, axes, i, place);
-    const sharp = uu * vv - uv * uv;
-    uu += BLUR;
-    vv += BLUR;
-    const area = uu * vv - uv * uv, far = (vv * du * du - 2 * uv * du * dv + uu * dv * dv) / area;
-    const alpha = opacities[i] * Math.exp(-far / 2) * (antialiased ? Math.sqrt(Math.max(sharp / area, 0)) : 1);
-    if (alpha > 1 / 255) hits.push([depth, first + i, Math.min(alpha, 0.999), [...center]]);
+    const far = 2 + (8 * camera.fx * reach) / depth;
+    for (let p = 0; p < pixels.length; p++) {
+      const du = pixels[p][0] - x, dv = pixels[p][1] - y;
+      if (Math.abs(du) > far || Math.abs(dv) > far) continue;
+      spread ??= spreadAt(camera, axes, i, place);
+      const [a, uv, b] = spread, uu = a + BLUR, vv = b + BLUR, area = uu * vv - uv * uv;
+      const sharp = antialiased ? Math.sqrt(Math.max((a * b - uv * uv) / area, 0)) : 1;
+      const alpha = opacities[i] * sharp * Math.exp((2 * uv * du * dv - vv * du * du - uu * dv * dv) / area / 2);
+      if (alpha > 1 / 255) hits[p].push([depth, first + i, Math.min(alpha, 0.999), [...center]]);
+    }
   }
-  return hits;
 }
 
 /** Compute the covariance of a Gaussian's ellipse around its place in a view, square pixels: uu, uv, vv. */

@@ -6,7 +6,7 @@ import { fitted } from "./like.js";
 import { BLUR, spreadAt } from "./pick.js";
 import { seenAt } from "./space.js";
 
-const { LEVELS, LEAST, PART, DEPTH, FILLED, SHARED, SPLINTER, VIEWS, CRUMB, OFTEN, OVER, OVERLAP, OUTLIERS, COLORED, PRESENT, SAME, SLIM, STRAIGHT, ROUND, CROWN } = language.things;
+const { LEVELS, LEAST, PART, DEPTH, FILLED, SHARED, SPLINTER, VIEWS, CRUMB, OFTEN, OVER, OVERLAP, OUTLIERS, COLORED, PRESENT, SLIM, STRAIGHT, ROUND, CROWN, LIGHT, PLACES, SHOWN } = language.things;
 const SIDE = 256; // pixels of a view's longer side
 const HIDDEN = 1e-3; // of a pixel's light: what lies behind is not seen
 const HOT = 0.1; // share of a pixel that one hot Gaussian covers where the map may be hot
@@ -36,35 +36,38 @@ export function isThere(relevancy, { best }) {
   return peak > LEVELS[0];
 }
 
-/** Things that were found before: one keeps its id whatever word finds it. */
-export class Known {
-  constructor(mass) {
-    Object.assign(this, { mass, things: [] });
-  }
-
-  id({ id, rows }) {
-    const total = (some) => some.reduce((sum, i) => sum + this.mass[i], 0), own = new Set(rows), size = total(rows);
-    for (const other of this.things) {
-      const shared = total(other.rows.filter((i) => own.has(i)));
-      if (shared > SAME * (size + other.size - shared)) return other.id;
+/** Tell which things of a word, by their rows, a view shows: see things/outlines.py. hitsAt: lists what pixels show, as
+ * pick.js; rowOf: finds the row of what it lists. */
+export function areShown(things, camera, centers, hitsAt, rowOf) {
+  const owner = new Map(), places = [], counts = things.map(() => ({ own: 0, all: 0 }));
+  things.forEach((rows, t) => {
+    for (const i of rows) owner.set(i, t);
+    for (let k = 0; k < rows.length; k += 1 + Math.floor((rows.length - 1) / PLACES)) {
+      const [x, y, z] = seenAt(camera, centers.subarray(3 * rows[k], 3 * rows[k] + 3));
+      if (z > 0 && x >= 0 && x < camera.width && y >= 0 && y < camera.height) places.push({ t, pixel: [Math.floor(x) + 0.5, Math.floor(y) + 0.5] });
     }
-    this.things.push({ id, rows, size });
-    return id;
-  }
+  });
+  hitsAt(camera, places.map(({ pixel }) => pixel)).forEach((hits, k) => {
+    const { t } = places[k], lit = hits.map(([id, weight]) => [owner.get(rowOf(id)), weight]), light = (some) => some.reduce((sum, [, weight]) => sum + weight, 0);
+    const any = light(lit.filter(([of]) => of !== undefined)), own = light(lit.filter(([of]) => of === t));
+    if (any > LIGHT && own > any / 2) counts[t].own++;
+    counts[t].all++;
+  }); // prettier-ignore
+  return counts.map(({ own, all }) => own > 0 && own >= SHOWN * all);
 }
 
 const photosOf = ({ votes }) => new Set(votes.map(({ view }) => view));
 
 function described({ rows, weight, votes }, { centers, mass, edges }, weights, relevancy) {
+  const shown = new Map(), strength = (i) => mass[i] * (shown.get(i) ?? 0) * relevancy[i] ** 2;
+  for (const piece of votes) for (const i of piece.rows) shown.set(i, (shown.get(i) ?? 0) + 1);
   let id = rows[0], heavy = 0, sum = 0;
   for (const i of rows) {
-    if (mass[i] > mass[id]) id = i;
+    if (strength(i) > strength(id)) id = i;
     heavy += Math.max(mass[i], 1e-9);
     sum += Math.max(mass[i], 1e-9) * relevancy[i];
   }
-  const best = new Map();
-  for (const piece of [...votes].sort((a, b) => a.cut - b.cut || b.area - a.area)) if (!best.has(piece.view)) best.set(piece.view, piece.box);
-  const seen = [...best].map(([view, box]) => ({ view, box }));
+  const seen = [...new Set([...votes].sort((a, b) => a.cut - b.cut || b.area - a.area).map(({ view }) => view))];
   return { id, weight, views: seen.length, score: sum / heavy, rows: Uint32Array.from(rows).sort(), seen, ...uprightBox(rows, centers, weights, edges) };
 }
 
@@ -140,7 +143,7 @@ export function drawn(view, scene, heat) {
     if (map[at] > 0) depth[at] /= map[at];
     if (clear[at] < 1) surface[at] /= 1 - clear[at];
   }
-  return { map, depth, surface, width, height, rows, points, focal: fx, scale };
+  return { map, depth, surface, width, height, rows, points, focal: fx };
 }
 
 /** Find the ellipse that a Gaussian fills in a view; null if it fills none. */
@@ -164,7 +167,7 @@ function eachRow({ x, y, reach, tall, slope, narrow }, { width, height }, paint)
 // ── pieces ──
 
 /** Find the pieces of a map that is drawn, with the Gaussians that each one shows. */
-export function piecesOf({ map, depth, surface, width, height, rows, points, focal, scale }, view) {
+export function piecesOf({ map, depth, surface, width, height, rows, points, focal }, view) {
   const { labels, pieces } = split(map, width, height), own = pieces.map(() => []);
   for (let k = 0; k < rows.length; k++) {
     const x = points[3 * k], y = points[3 * k + 1], z = points[3 * k + 2];
@@ -182,7 +185,7 @@ export function piecesOf({ map, depth, surface, width, height, rows, points, foc
       (left = Math.min(left, x)), (top = Math.min(top, y)), (right = Math.max(right, x + 1)), (bottom = Math.max(bottom, y + 1));
     }
     const cut = left <= 1 || top <= 1 || right >= width - 1 || bottom >= height - 1;
-    return [{ view, rows: own[k], resolution: focal / middle, area: pixels.length, box: [left, top, right, bottom].map((side) => side / scale), cut }];
+    return [{ view, rows: own[k], resolution: focal / middle, area: pixels.length, cut }];
   });
 }
 

@@ -6,13 +6,13 @@ import { likeness } from "./like.js";
 import { bestPhoto, gaussiansAt, middleOf, unpackSplats } from "./pick.js";
 import { freeSpace } from "./space.js";
 import { fetched } from "./think.js";
-import { isThere, Known, thingsOf } from "./things.js";
+import { areShown, isThere, thingsOf } from "./things.js";
 import { ancestry, FAN } from "./tree.js";
 import { Vocabulary } from "./vocabulary.js";
 
 const EXAMPLE = 5; // number of Gaussians that represent a clicked place
 const INSIDE = 60; // Gaussians that represent an outlined place
-let about, answers, vocabulary, geometry, views, mass, field, known;
+let about, answers, vocabulary, geometry, views, mass, field;
 const parts = new Map(); // of the scene, by number: { geometry, opacities, floats, answers, root }; chunk 0 is the whole scene
 let limit = 255;
 
@@ -53,15 +53,16 @@ function gaussian(id) {
   return { rows, i, root: root(i) };
 }
 
-/** List what a pixel shows: [number, weight, center] of Gaussians with a meaning. */
-function meantAt(camera, x, y) {
-  return hitsAt(camera, x, y).filter(([id]) => {
+/** List what each pixel shows: [number, weight, center] of Gaussians with a meaning. */
+function meantAt(camera, pixels) {
+  const isMeant = ([id]) => {
     const { rows, i } = gaussian(id);
     return rows.scales[i];
-  });
+  };
+  return hitsAt(camera, pixels).map((hits) => hits.filter(isMeant));
 }
 
-const hitsAt = (camera, x, y) => gaussiansAt([...parts.values()].map(({ geometry }) => geometry), camera, x, y, about.antialiased);
+const hitsAt = (camera, pixels) => gaussiansAt([...parts.values()].map(({ geometry }) => geometry), camera, pixels, about.antialiased);
 
 /** Move a point into the world's frame. */
 const inWorld = (point) => point.map((value, axis) => value + about.center[axis]);
@@ -85,7 +86,6 @@ const jobs = {
       pose: view.pose.map((row, axis) => (axis < 3 ? [...row.slice(0, 3), row[3] - about.center[axis]] : row)),
     }));
     mass = massOf(views, words.count);
-    known = new Known(mass);
     answers.foreground = about.foreground.length ? new Uint8Array(await bytes("foreground.bin")) : null;
     return vocabulary.listed;
   },
@@ -133,12 +133,15 @@ const jobs = {
     if (!isThere(relevancy, about.words.rules)) return { things: [], candidates: [] };
     const found = thingsOf(views, { ...geometry, mass, gap: about.words.gap, edges: about.edges, antialiased: about.antialiased }, relevancy, taught);
     const placed = (thing) => ({ ...thing, center: inWorld(thing.center) });
-    return { things: found.things.map((thing) => placed({ ...thing, id: known.id(thing) })), candidates: found.candidates.map(placed) };
+    return { things: found.things.map(placed), candidates: found.candidates.map(placed) };
   },
+
+  /** Tell for each list of things, by their rows, which ones a view shows. */
+  shown: ({ camera, lists }) => lists.map((things) => areShown(things, camera, geometry.centers, hitsAt, (id) => gaussian(id).root)),
 
   /** Find the words that match a pixel best, and its Gaussians; none where too few of them have a meaning. */
   whatIs({ camera, x, y, most }) {
-    const hits = meantAt(camera, x, y);
+    const [hits] = meantAt(camera, [[x, y]]);
     const blend = new Float64Array(about.words.width);
     let covered = 0;
     for (const [id, weight] of hits) {
@@ -163,7 +166,7 @@ const jobs = {
 
   /** Find the point of the world at a pixel; null where nothing is. */
   point({ camera, x, y }) {
-    const middle = middleOf(hitsAt(camera, x, y));
+    const middle = middleOf(hitsAt(camera, [[x, y]])[0]);
     return middle && inWorld(middle);
   },
 
@@ -171,8 +174,7 @@ const jobs = {
    * most of them. prefer: numbers of photos that should be taken if they show them. */
   mark({ camera, pixels, prefer, most = EXAMPLE }) {
     const weights = new Map(), points = [];
-    for (const [x, y] of pixels) {
-      const hits = meantAt(camera, x, y);
+    for (const hits of meantAt(camera, pixels)) {
       const middle = middleOf(hits);
       const strong = hits.sort((a, b) => b[1] - a[1]).slice(0, EXAMPLE).map(([id, weight]) => [gaussian(id).root, weight]);
       for (const [i, weight] of strong) weights.set(i, (weights.get(i) ?? 0) + weight);

@@ -33,7 +33,7 @@ from lang3dxl_ns.query.thresholds import EVEN, SHARE
 from lang3dxl_ns.query.trust import ALIKE, ANCHORS, CLEARLY, FAINT, FAR, STRICTER, STRICTEST
 from lang3dxl_ns.query.visibility import spread
 from lang3dxl_ns.query.vocabulary import closest_word, common_words, same_thing, shipped_vocabulary
-from lang3dxl_ns.things import find, grammar, join, pieces, thing
+from lang3dxl_ns.things import find, grammar, join, outlines, pieces, thing
 from lang3dxl_ns.web import pack
 from lang3dxl_ns.web.levels import MOST_ROWS, SMALL, Levels, levels_of
 from lang3dxl_ns.web.photos import extent, photo_json, photos_shown, small_photo
@@ -65,7 +65,8 @@ _NUMBERS = (
     ("things", pieces, "LEVELS LEAST PART DEPTH FILLED"),
     ("things", join, "SHARED SPLINTER VIEWS CRUMB OFTEN OVER OVERLAP SLIM STRAIGHT ROUND CROWN"),
     ("things", thing, "OUTLIERS"),
-    ("things", find, "COLORED PRESENT SAME SURE MISSED"),
+    ("things", find, "COLORED PRESENT SURE MISSED"),
+    ("things", outlines, "LIGHT PLACES SHOWN"),
     ("things", grammar, "BESIDE INSIDE CLOSE"),
 )
 """Numbers that rank views, tell things apart and relate them, by the modules that hold them."""

@@ -15,10 +15,10 @@ from PIL import Image
 
 from lab.baselines.lifting import LiftedFeatures
 from lang3dxl_ns.cli import main
-from lang3dxl_ns.commands.coco import CocoLabels
 from lang3dxl_ns.commands.export import Export
 from lang3dxl_ns.commands.teach import Teach, forgotten
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.files.coco import CocoLabels
 from lang3dxl_ns.files.scene_file import (
     Provenance,
     describe_scene_file,

@@ -1,5 +1,8 @@
 """`lang3dxl things` answers as it was asked, and tells which part of a question it did not use."""
 
+import csv
+import json
+
 import pytest
 from painted_scene import painted_scene
 
@@ -70,3 +73,30 @@ def test_left_is_told_within_the_photo_that_one_names(ask):
     assert "1 found: id " in ask("leftmost window", view=name)[-1]
     with pytest.raises(UserError, match="only 2 found in this view"):
         ask("third window from the left", view=name)
+
+
+
+def test_one_table_is_printed_and_written_and_labels_have_one_category_for_a_word(ask, tmp_path):
+    lines = ask("leftmost window", text=["windows", "dome"], out=tmp_path)
+    start = next(i for i, line in enumerate(lines) if line.startswith("number"))
+    with (tmp_path / "things.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    catalog = json.loads((tmp_path / "things.json").read_text())
+    for row, line, told in zip(rows, lines[start + 1 :], catalog["things"], strict=False):
+        assert line.split()[:3] == [row["number"], row["word"], row["id"]]
+        assert line.split()[-2:] == [f"{float(row['score']):.2f}", row["photo"]]
+        assert [told[name] for name in ("number", "word", "id")] == [
+            int(row["number"]),
+            row["word"],
+            int(row["id"]),
+        ]
+        assert told["photos"][0]["photo"] == row["photo"]
+    assert [[row["word"], row["number"]] for row in rows] == [
+        ["windows", "1"],
+        ["windows", "2"],
+        ["dome", "1"],
+    ]
+    labels = json.loads((tmp_path / "instances.json").read_text())
+    assert [one["name"] for one in labels["categories"]] == ["windows", "dome"]
+    pairs = [(one["image_id"], one["thing"]) for one in labels["annotations"]]
+    assert len(pairs) == len(set(pairs)) > len(rows)

@@ -3,12 +3,13 @@
 import csv
 import json
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
-from painted_scene import painted_file, painted_scene
+from painted_scene import WINDOWS, painted_file, painted_scene
 
 from lab.benchmarks.questions import Known, ask_all, in_words, questions
 from lab.benchmarks.things import Score, pooled_f1
@@ -16,14 +17,17 @@ from lab.landmark.instances import true_things
 from lab.landmark.landmark import Landmark
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.query.trust import FAR
-from lang3dxl_ns.rendering import Camera, Rendering
+from lang3dxl_ns.rendering import Camera, Rendering, Splats
+from lang3dxl_ns.scene.camera import in_camera_frame
 from lang3dxl_ns.scene.georeference import Georeference
 from lang3dxl_ns.things.find import PRESENT, Things, axes_of, heights_of, things_of, up_of
 from lang3dxl_ns.things.grammar import Request, Sight, answer, assumed, meant, parse, sight_of, table, unsure
 from lang3dxl_ns.things.join import OFTEN, Joined, grown, join, placed, without_crumbs
+from lang3dxl_ns.things.outlines import outlined
 from lang3dxl_ns.things.pieces import Piece, Shown, pieces_of, split
 from lang3dxl_ns.things.thing import Thing, upright_box
-from lang3dxl_ns.things.write import outlined, write_catalog
+from lang3dxl_ns.things.write import coco, write_catalog
+from lang3dxl_ns.words.taught_words import mask_of
 
 SIGHT = Sight(np.array([1.0, 0, 0]), np.array([0, 0, 1.0]), np.array([0, 1.0, 0]))
 
@@ -360,6 +364,33 @@ def test_a_thing_keeps_its_id_in_later_questions_and_under_other_words():
     assert {one.id for one in alone.things} == {one.id for one in first.things}
 
 
+def test_what_was_asked_before_changes_no_id():
+    scene, fresh = painted_scene(), painted_scene()
+    asked, wider = scene.ask("windows"), scene.ask("windows")
+    match = scene.splats.means[asked.relevancy[0] > 0.9]
+    near = torch.cdist(scene.splats.means, match).min(1).values
+    edge = (near > 0) & (near < 0.2)
+    wider.__dict__["relevancy"] = torch.where(edge, 0.95, wider.relevancy)
+    for one in (scene, fresh):
+        vars(one)["mass"] = torch.where(edge, 3 * one.mass, one.mass)
+    (before,), (after,), (alone,) = (
+        things_of(*pair) for pair in ((scene, wider), (scene, asked), (fresh, asked))
+    )
+    assert [one.id for one in after.things] == [one.id for one in alone.things]
+    assert {one.id for one in before.things}.isdisjoint(one.id for one in after.things)
+    assert not edge[[one.id for one in after.things]].any()  # heavier, but the word doesn't fit it
+
+
+def test_the_heavier_thing_comes_first():
+    scene = painted_scene()
+    x, question = scene.splats.means[:, 0], scene.ask("windows")
+    plain = question.relevancy
+    for half, first in ((x > -0.8, 0), (x < -1.8, 1)):  # a half of the right window, or of the left one
+        question.__dict__["relevancy"] = torch.where(half, 0.0, plain)
+        (found,) = things_of(scene, question)
+        assert [one.center[0] < -1.3 for one in found.things] == [first == 0, first == 1]
+
+
 def test_what_a_word_that_hardly_fits_finds_are_candidates(monkeypatch):
     monkeypatch.setattr("lang3dxl_ns.things.find.PRESENT", 1.1)
     (answer,) = painted_scene().things("windows")
@@ -398,18 +429,77 @@ def test_the_catalog_names_the_nearest_neighbors_and_what_is_in_what(tmp_path):
     assert [1, side, 2] in graph
 
 
+def gaussians(*places, scale: float = 0.12) -> Splats:
+    """Round, nearly opaque Gaussians at places [n, 3], for each list of them."""
+    means = torch.tensor(np.concatenate(places), dtype=torch.float32)
+    count = len(means)
+    quats = torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1)
+    return Splats(
+        means, quats, torch.full((count, 3), scale), torch.full((count,), 0.95), torch.zeros(count, 1, 3)
+    )
+
+
+def grid(center, size) -> np.ndarray:
+    """Places .2 apart that fill a box."""
+    axes = [np.arange(-s / 2, s / 2 + 0.01, 0.2) for s in size]
+    return np.stack(np.meshgrid(*axes), -1).reshape(-1, 3) + center
+
+
 def test_outlines_are_drawn_around_what_a_view_shows_and_not_around_what_it_hides():
     camera = Camera(torch.eye(4), torch.tensor([[50.0, 0, 50], [0, 50.0, 40], [0, 0, 1]]), 100, 80)
-    wall = Rendering(camera, torch.full((80, 100, 3), 0.5), torch.ones(80, 100), torch.full((80, 100), 5.0))
+    gray = Rendering(camera, torch.full((80, 100, 3), 0.5), torch.ones(80, 100), torch.full((80, 100), 5.0))
     shown = thing(1, "window", (1, 0, 5), (1.0, 2.0, 0.2))
-    others = [thing(2, "window", (-2, 0, 7)), thing(3, "window", (0, 0, -5)), thing(4, "window", (9, 0, 5))]
-    plain = outlined(wall, [])
+    behind, around = thing(2, "window", (-2, 0, 7)), thing(3, "window", (0, 0, -5))
+    others = [behind, around, thing(4, "window", (9, 0, 5))]
+    own = [grid(one.center, one.size) for one in (shown, *others)]
+    wall = grid((0, 0, 5), (8, 6, 0))
+    wall = wall[(abs(wall - shown.center) > shown.size / 2).any(1)]
+    ends = np.cumsum([0, *map(len, own)])
+    shown, *others = (
+        replace(one, rows=np.arange(a, b))
+        for one, (a, b) in zip((shown, *others), pairwise(ends), strict=True)
+    )
+    splats = gaussians(*own, wall)
+    plain = outlined(splats, [], gray)
     assert (plain == 128).all()
-    assert (outlined(wall, [Things("window", others)]) == plain).all()  # behind the wall, behind us, aside
-    rows, columns = (outlined(wall, [Things("window", [shown, *others])]) != plain).any(2).nonzero()
+    assert (outlined(splats, [Things("window", others)], gray) == plain).all()
+    bare = gaussians(*own)  # without the wall, what lies behind it is seen
+    assert (outlined(bare, [Things("window", others)], gray) != plain).any()
+    drawn = outlined(splats, [Things("window", [shown, *others])], gray)
+    rows, columns = (drawn != plain).any(2).nonzero()
     # Its front side is 4.9 away: 10.2 by 20.4 pixels around column 60 and row 40.
     assert [columns.min(), columns.max()] == pytest.approx([55, 65], abs=1.5)
     assert [rows.min(), rows.max()] == pytest.approx([29.8, 50.2], abs=1.5)
+    twice = [Things("window", [shown, *others]), Things("opening", [shown])]
+    assert (outlined(splats, twice, gray) == drawn).all()  # once, under the first word
+
+
+def test_labels_of_photos_cover_the_things_in_pixels_of_the_files():
+    plain = painted_file()
+    photos = [replace(photo, file=(192, 288)) for photo in plain.photos]
+    scene = painted_scene(file=replace(plain, photos=photos))
+    (found,) = scene.things("windows")
+    content = coco(scene, [found])
+    assert {(one["width"], one["height"]) for one in content["images"]} == {(192, 288)}
+    centers = [one.center[0] for one in found.things]
+    for photo, image in zip(photos, content["images"], strict=True):
+        labels = {one["thing"]: one for one in content["annotations"] if one["image_id"] == image["id"]}
+        lens = photo.camera.intrinsics.numpy()
+        for one in found.things:
+            left, right, bottom, top = WINDOWS[int(one.center[0] > np.mean(centers))]
+            ends = in_camera_frame(photo.camera, torch.tensor([[left, bottom, 0.0], [right, top, 0]])).numpy()
+            (x, y), (x2, y2) = np.sort(((ends / ends[:, 2:]) @ lens[:2].T) * (2, 3), axis=0)
+            if not (0 < x < x2 < 192 and 0 < y < y2 < 288):
+                continue  # cut off
+            label = labels[one.id]
+            assert label["segmentation"]["size"] == [288, 192]
+            mask = mask_of(label["segmentation"]["counts"], (288, 192))
+            assert mask.sum() == label["area"]
+            rows, columns = mask.nonzero()
+            box = [columns.min(), rows.min(), np.ptp(columns) + 1, np.ptp(rows) + 1]
+            assert label["bbox"] == box == pytest.approx([x, y, x2 - x, y2 - y], abs=4)
+    shown = {image["file_name"] for image in content["images"]}
+    assert "held/0004.jpg" in shown and len(content["annotations"]) > 4
 
 
 @pytest.mark.parametrize("known", [True, False])
@@ -419,6 +509,7 @@ def test_the_catalog_has_meters_where_the_scene_has_them(known, tmp_path):
     one = thing(3, "window", (0, 0, 0), (1, 2, 4))
     write_catalog(scene, [Things("window", [one], [])], tmp_path)
     catalog = json.loads((tmp_path / "things.json").read_text())
+    assert catalog["things"][0]["number"] == 1
     assert catalog["things"][0]["meters"] == ([2.5, 5.0, 10.0] if known else None)
     assert (catalog["unit"] or {}).get("meters") == (2.5 if known else None)
     ground, top = catalog["heights"]

@@ -18,6 +18,7 @@ from lang3dxl_ns.scene.camera import in_camera_frame
 from lang3dxl_ns.things.find import Things
 from lang3dxl_ns.things.grammar import Sight, answer, assumed, parse, unsure
 from lang3dxl_ns.things.join import Joined, grown, join, placed, without_crumbs
+from lang3dxl_ns.things.outlines import shown
 from lang3dxl_ns.things.pieces import LEVELS, Piece, split
 from lang3dxl_ns.things.thing import Thing, upright_box
 from lang3dxl_ns.web.pack import camera_json, splat_bytes
@@ -232,6 +233,32 @@ def test_a_view_is_drawn_as_python_renders_it(page, antialiased):
     assert ((drawn[0] > LEVELS[0]) == where).mean() > 0.97
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_a_view_shows_the_things_that_it_shows_in_python(page, seed):
+    """Round Gaussians in a box, of which things hold the neighbors of some: many hide each other."""
+    rng, count = np.random.default_rng(seed), 1500
+    means = torch.tensor(rng.uniform((-3, -2, 3), (3, 2, 9), (count, 3)), dtype=torch.float32)
+    scales, opacities = torch.full((count, 3), 0.12), torch.full((count,), 0.9)
+    quats = torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1)
+    splats = Splats(means, quats, scales, opacities, torch.zeros(count, 1, 3))
+    camera = Camera(torch.eye(4), torch.tensor([[60.0, 0, 40], [0, 60, 30], [0, 0, 1]]), 80, 60)
+    owner = torch.cdist(means, means[:40]).min(1)
+    near = np.where(owner.values < 0.7, owner.indices, -1)
+    found = [Thing(n, "window", 1.0, 3, np.zeros(3), np.eye(3), np.ones(3), (near == n).nonzero()[0])
+             for n in range(40)]  # fmt: skip
+    expected = {number - 1 for number, _, _ in shown(splats, camera, found)}
+    packed = splat_bytes(splats, torch.zeros(3), torch.zeros(3)).ravel().tolist()
+    given = {"packed": packed, "camera": camera_json(camera), "things": [one.rows.tolist() for one in found]}
+    body = """const { gaussiansAt, unpackSplats } = await import("./pick.js");
+      const { packed, camera, things } = given;
+      const scene = unpackSplats(Uint8Array.from(packed).buffer);
+      const hitsAt = (view, pixels) => gaussiansAt([scene], view, pixels, false);
+      return m.areShown(things, camera, scene.centers, hitsAt, (id) => id);"""
+    told = module(page, "things", body, given)
+    assert 5 < len(expected) < 35
+    assert len(expected ^ {n for n, is_shown in enumerate(told) if is_shown}) <= 1  # bytes round
+
+
 def test_pieces_join_as_in_python(page):
     rng = np.random.default_rng(1)
     pieces = []
@@ -321,6 +348,7 @@ def test_a_word_lists_its_things_and_one_can_be_chosen_hidden_and_linked(page):
     page.locator("#prompts ol li:first-child button[aria-pressed=true]").wait_for()
     page.get_by_role("button", name="Hide the rest").click()
     until(page, "lang3dxl.view.only !== null")
+    until(page, "document.querySelectorAll('#boxes path.thing').length", 1)
     shown = page.evaluate("lang3dxl.view.only.size")
     assert 0 < shown < page.evaluate("lang3dxl.view.root.count")
     until_linked(page, "thing=")

@@ -1,4 +1,4 @@
-"""Labels in COCO's format: the masks of texts in photos."""
+"""Labels in COCO's format: masks of texts and of single things in photos."""
 
 from __future__ import annotations
 
@@ -44,22 +44,32 @@ class CocoLabels:
 
     def add(self, photo: str, masks: Sequence[Bool[Array, "h w"]]) -> None:
         """Add a photo by name, with one mask per category, at the size of the photo's file."""
-        images, annotations = self.content["images"], self.content["annotations"]
         height, width = masks[0].shape
-        images.append({"id": len(images) + 1, "file_name": photo, "width": width, "height": height})
+        self.add_photo(photo, (width, height))
         for category, mask in enumerate(masks, start=1):
             numbers, _ = label(mask)
             for number, place in enumerate(find_objects(numbers), start=1):
                 part = numbers[place] == number
-                area = int(np.count_nonzero(part))
-                if area < _LEAST_PART * mask.size:
-                    continue
-                rows, columns = place
-                box = [columns.start, rows.start, columns.stop - columns.start, rows.stop - rows.start]
-                outline = {"size": [height, width], "counts": _runs(part, place, mask.shape)}
-                labeled = {"id": len(annotations) + 1, "image_id": len(images), "category_id": category}
-                found = {"segmentation": outline, "area": area, "bbox": box, "iscrowd": 0}
-                annotations.append({**labeled, **found})
+                if np.count_nonzero(part) >= _LEAST_PART * mask.size:
+                    self.add_label(category, part, place)
+
+    def add_photo(self, photo: str, size: tuple[int, int]) -> None:
+        """Add a photo by name, with width and height of its file. Labels that are added next are on it."""
+        images = self.content["images"]
+        images.append({"id": len(images) + 1, "file_name": photo, "width": size[0], "height": size[1]})
+
+    def add_label(
+        self, category: int, part: Bool[Array, "r c"], place: tuple[slice, slice], **more: float
+    ) -> None:
+        """Add a label of a category (from 1): a part of the photo, by its mask and the rows and columns that
+        this fills, in pixels of the file. more: further fields of the annotation."""
+        image, annotations = self.content["images"][-1], self.content["annotations"]
+        size, (rows, columns) = (image["height"], image["width"]), place
+        box = [columns.start, rows.start, columns.stop - columns.start, rows.stop - rows.start]
+        labeled = {"id": len(annotations) + 1, "image_id": image["id"], "category_id": category}
+        outline = {"size": [*size], "counts": _runs(part, place, size)}
+        found = {"segmentation": outline, "area": int(np.count_nonzero(part)), "bbox": box, "iscrowd": 0}
+        annotations.append({**labeled, **found, **more})
 
     def write(self, path: Path) -> None:
         """Write the COCO file, atomically."""
