@@ -364,12 +364,14 @@ def test_a_thing_keeps_its_id_in_later_questions_and_under_other_words():
     assert {one.id for one in alone.things} == {one.id for one in first.things}
 
 
-def test_what_was_asked_before_changes_no_id():
+def test_what_was_asked_before_changes_no_id(monkeypatch):
+    monkeypatch.setattr("lang3dxl_ns.things.find.COLORED", 10**9)
     scene, fresh = painted_scene(), painted_scene()
     asked, wider = scene.ask("windows"), scene.ask("windows")
     match = scene.splats.means[asked.relevancy[0] > 0.9]
     near = torch.cdist(scene.splats.means, match).min(1).values
     edge = (near > 0) & (near < 0.2)
+    asked.__dict__["relevancy"] = torch.where(edge, 0.4, asked.relevancy)
     wider.__dict__["relevancy"] = torch.where(edge, 0.95, wider.relevancy)
     for one in (scene, fresh):
         vars(one)["mass"] = torch.where(edge, 3 * one.mass, one.mass)
@@ -378,7 +380,7 @@ def test_what_was_asked_before_changes_no_id():
     )
     assert [one.id for one in after.things] == [one.id for one in alone.things]
     assert {one.id for one in before.things}.isdisjoint(one.id for one in after.things)
-    assert not edge[[one.id for one in after.things]].any()  # heavier, but the word doesn't fit it
+    assert all(edge[one.rows].any() and not edge[one.id] for one in after.things)  # it fits, if less
 
 
 def test_the_heavier_thing_comes_first():

@@ -256,7 +256,7 @@ def test_a_view_shows_the_things_that_it_shows_in_python(page, seed):
       return m.areShown(things, camera, scene.centers, hitsAt, (id) => id);"""
     told = module(page, "things", body, given)
     assert 5 < len(expected) < 35
-    assert len(expected ^ {n for n, is_shown in enumerate(told) if is_shown}) <= 1  # bytes round
+    assert len(expected ^ {n for n, is_shown in enumerate(told) if is_shown}) <= 2  # bytes round
 
 
 def test_pieces_join_as_in_python(page):
@@ -346,6 +346,8 @@ def test_a_word_lists_its_things_and_one_can_be_chosen_hidden_and_linked(page):
     until(page, "document.querySelectorAll('#boxes path.thing').length", 2)
     page.evaluate("document.body.dispatchEvent(new KeyboardEvent('keydown', { key: ']', bubbles: true }))")
     page.locator("#prompts ol li:first-child button[aria-pressed=true]").wait_for()
+    page.get_by_role("button", name="Overview").click()
+    until(page, "document.querySelectorAll('#boxes path.thing').length", 2)
     page.get_by_role("button", name="Hide the rest").click()
     until(page, "lang3dxl.view.only !== null")
     until(page, "document.querySelectorAll('#boxes path.thing').length", 1)
