@@ -104,6 +104,7 @@ def of_things_among_a_million_gaussians() -> None:
 def passes(function, *arguments) -> None:
     done = Process(function, *arguments).wait(1800)
     assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-2000:]
+    print(done.stdout)
 
 
 def test_eight_threads_give_what_one_gives_from_one_pool():

@@ -37,13 +37,7 @@ class ListThings(OfScene):
         from lang3dxl_ns.query.ask import Text, prompts_of
         from lang3dxl_ns.query.text import Prompt, caution
         from lang3dxl_ns.things.grammar import in_words, meant, parse, sight_of
-        from lang3dxl_ns.things.write import (
-            each_word_once,
-            printed,
-            write_catalog,
-            write_picture,
-            write_things,
-        )
+        from lang3dxl_ns.things.write import each_word_once, table, write_catalog, write_picture, write_things
 
         if not (self.text or self.ask):
             raise UserError("give --text or --ask: say which things to look for, such as --text windows")
@@ -68,7 +62,7 @@ class ListThings(OfScene):
         own = set(prompts_of(scene, self.text)) if self.text else set()
         named = [one for prompt, one in zip(prompts, answers, strict=True) if prompt in own]
         if any(one.things for one in named):
-            say(*printed(scene, each_word_once(named)))
+            say(*table(scene, each_word_once(named)))
         every = [thing for one in answers for thing in (*one.things, *one.candidates)]
         seen = None if self.view is None else sight_of(scene, every, self.view)
         refused = []

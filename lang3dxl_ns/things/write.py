@@ -44,7 +44,7 @@ def each_word_once(answers: Sequence[Things]) -> list[Things]:
     return [one for k, one in enumerate(answers) if not any(forms[k] & other for other in forms[:k])]
 
 
-def printed(scene: Scene, answers: Sequence[Things]) -> list[str]:
+def table(scene: Scene, answers: Sequence[Things]) -> list[str]:
     """Format a table of things: number, word, id, size, score and the photo that shows it best."""
     place = scene.file.georeference
     unit, scale = ("units", 1.0) if place is None else ("m", place.meters)
@@ -70,8 +70,8 @@ def write_catalog(scene: Scene, answers: Sequence[Things], folder: Path) -> None
     sizes = {one.name: np.divide(one.file_size, (one.lens.width, one.lens.height)) for one in scene.photos}
     zooms = {name: np.tile(zoom, 2) for name, zoom in sizes.items()}
     rows, listed = io.StringIO(), []
-    table = csv.writer(rows, lineterminator="\n")
-    table.writerow(COLUMNS)
+    lines = csv.writer(rows, lineterminator="\n")
+    lines.writerow(COLUMNS)
     for _, number, thing in numbered(answers):
         meters = None if place is None else (place.meters * thing.size).round(2).tolist()
         above = round(unit * (float(thing.center @ up) - ground), 3)
@@ -81,7 +81,7 @@ def write_catalog(scene: Scene, answers: Sequence[Things], folder: Path) -> None
         listed.append({"number": number, **thing.as_json(), **more})
         told = number, thing.word, thing.id, round(thing.score, 3), thing.views
         box = *thing.center.round(4).tolist(), *thing.size.round(4).tolist()
-        table.writerow([*told, *box, thing.best_photo, *(meters or [""] * 3)])
+        lines.writerow([*told, *box, thing.best_photo, *(meters or [""] * 3)])
     content = {"words": words, "things": listed, "relations": graph, "heights": [ground, top]}
     content |= {"up": up.tolist(), "unit": None if place is None else asdict(place)}
     write_atomically(folder / "things.json", json.dumps(content, indent=1) + "\n")
