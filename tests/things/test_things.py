@@ -476,7 +476,7 @@ def test_outlines_are_drawn_around_what_a_view_shows_and_not_around_what_it_hide
     assert (outlined(splats, twice, gray) == drawn).all()  # once, under the first word
 
 
-def test_labels_of_photos_cover_the_things_in_pixels_of_the_files():
+def test_labels_of_photos_cover_the_things_in_pixels_of_the_files(tmp_path):
     plain = painted_file()
     photos = [replace(photo, file=(192, 288)) for photo in plain.photos]
     scene = painted_scene(file=replace(plain, photos=photos))
@@ -500,6 +500,13 @@ def test_labels_of_photos_cover_the_things_in_pixels_of_the_files():
             rows, columns = mask.nonzero()
             box = [columns.min(), rows.min(), np.ptp(columns) + 1, np.ptp(rows) + 1]
             assert label["bbox"] == box == pytest.approx([x, y, x2 - x, y2 - y], abs=4)
+    write_catalog(scene, [found], tmp_path)
+    numbers = {image["file_name"]: image["id"] for image in content["images"]}
+    boxes = {(one["image_id"], one["thing"]): one["bbox"] for one in content["annotations"]}
+    for one in json.loads((tmp_path / "things.json").read_text())["things"]:
+        for seen in one["photos"]:  # the piece that a photo shows of it
+            x, y, wide, high = boxes[numbers[seen["photo"]], one["id"]]
+            assert seen["box"] == pytest.approx([x, y, x + wide, y + high], abs=10)
     shown = {image["file_name"] for image in content["images"]}
     assert "held/0004.jpg" in shown and len(content["annotations"]) > 4
 
