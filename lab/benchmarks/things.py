@@ -20,7 +20,7 @@ from numpy import ndarray as Array
 from scipy.optimize import linear_sum_assignment
 
 from lab.benchmarks.questions import Known, Outcome, ask_all, in_words
-from lab.landmark.instances import TrueThing, photos_of, pixels, placed, seen_things, true_things
+from lab.landmark.instances import CLEAR, TrueThing, photos_of, pixels, placed, seen_things, true_things
 from lab.landmark.labels import CATEGORIES
 from lab.landmark.landmark import Landmark
 from lab.reports import command_line
@@ -32,6 +32,7 @@ from lang3dxl_ns.rendering import composite
 from lang3dxl_ns.rendering.gathering import Pixels, gather
 from lang3dxl_ns.things.find import Things, axes_of
 from lang3dxl_ns.things.thing import Thing, upright_box
+from lang3dxl_ns.things.write import coco
 
 NEAR = 0.6
 """A thing is found if a center is this close to its own, relative to its longest edge."""
@@ -58,6 +59,7 @@ class ThingsBenchmark:
         rows: list[Score] = []
         asked: list[Outcome] = []
         seconds: dict[str, float] = {}
+        labels: list[tuple[int, int, float | None]] = []
         for path, data in zip(self.scene, self.data, strict=True):
             scene, truth = load_scene(path), true_things_of(load_scene(path), data)
             scene.mass  # noqa: B018 — measured once per scene, at the first query
@@ -66,6 +68,7 @@ class ThingsBenchmark:
             seconds[data.parent.name] = time.process_time() - start
             marks = marked_boxes(scene, data)
             rows += [score(answer, truth, data.parent.name, marks) for answer in answers]
+            labels += labels_of(scene, data, answers, truth)
             asked += ask_all(scene, {one.word: known(one, truth) for one in answers})
         table = markdown_table(
             [
@@ -84,7 +87,7 @@ class ThingsBenchmark:
         times = ", ".join(f"{name} {t:.1f}" for name, t in seconds.items())
         command = command_line("lang3dxl benchmark things", self)
         text = f"# Things\n\n    {command}\n\n{table}\n\nProcessor seconds per catalog: {times}\n"
-        text += f"\n{in_words(asked)}\n"
+        text += f"\n{labels_in_words(labels)}\n\n{in_words(asked)}\n"
         each = [vars(row) for row in rows]
         write_report(
             self.out,
@@ -171,6 +174,50 @@ def score(
     marked = ((answer.things[a], boxes.get(seen[b])) for a, b in pairs)
     marked_ious = tuple(box_iou(found, box) for found, box in marked if box is not None)
     return Score(scene, answer.word, len(seen), len(pairs), false, count, ious, marked_ious)
+
+
+def labels_of(
+    scene: Scene, data: Path, answers: Sequence[Things], truth: Sequence[TrueThing]
+) -> list[tuple[int, int, float | None]]:
+    """Compare the COCO labels of the things found with the true ones' pixels: for each of them and each
+    training photo the number of pixels that show it, of those that its label has, and their boxes' IoU."""
+    about, content = read_json(data / "scene.json"), coco(scene, answers)
+    landmark = Landmark.from_seed(about["seed"], about["family"])
+    _, numbers = true_things(landmark)
+    images = {image["file_name"]: image["id"] for image in content["images"]}
+    labels = {(one["image_id"], one["thing"]): one for one in content["annotations"]}
+    own = [(one, [t for t in truth if t.word == one.word and t.seen]) for one in answers]
+    pairs = [
+        (one.things[a].id, truth.index(seen[b])) for one, seen in own for a, b in matched(one.things, seen)
+    ]
+    found: list[tuple[int, int, float | None]] = []
+    for name, camera, _ in photos_of(about):
+        if name in scene.visible:
+            shown = pixels(landmark, numbers, camera, scene.file.photo(name).file_size)
+            for thing, number in pairs:
+                label, (rows, columns) = labels.get((images[name], thing)), (shown == number).nonzero()
+                iou = None
+                if label and len(rows):
+                    true = columns.min(), rows.min(), columns.max() + 1, rows.max() + 1
+                    iou = _overlap(label["bbox"], true)
+                found.append((len(rows), label["area"] if label else 0, iou))
+    return found
+
+
+def _overlap(box: Sequence[float], other: Sequence[float]) -> float:
+    """Intersection over union of a COCO box and of another's ends."""
+    (x, y, wide, high), (left, top, right, bottom) = box, other
+    shared = max(min(x + wide, right) - max(x, left), 0) * max(min(y + high, bottom) - max(y, top), 0)
+    return shared / (wide * high + (right - left) * (bottom - top) - shared)
+
+
+def labels_in_words(labels: Sequence[tuple[int, int, float | None]]) -> str:
+    """Tell how many of the things that photos clearly show have a label there, and how good that is."""
+    clear = [(area, iou) for pixels, area, iou in labels if pixels >= CLEAR]
+    labeled, false = sum(area > 0 for area, _ in clear), sum(area > 0 for n, area, _ in labels if not n)
+    iou = np.mean([iou for _, iou in clear if iou is not None] or [0])
+    told = f"Of {len(clear)} views of things found, {labeled} have a label (IoU of boxes {iou:.2f})"
+    return f"{told}; {false} labels are of things that the photo does not show."
 
 
 def known(answer: Things, truth: Sequence[TrueThing]) -> Known:

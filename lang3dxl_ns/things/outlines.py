@@ -20,8 +20,8 @@ from lang3dxl_ns.things.find import Things
 from lang3dxl_ns.things.thing import Thing
 
 LIGHT = 1 / 3
-"""Share of a pixel's light that comes from a thing where the pixel shows it. In the demo's 48 photos, masks
-are as large as the true ones then, and 93 % of the things that photos show have one."""
+"""Share of a pixel's light that comes from a thing where the pixel shows it. Masks in the demo's photos are
+as large as the true ones then, and 94 % of the views of things have one (`lang3dxl benchmark things`)."""
 PLACES = 8
 """Number of a thing's Gaussians, at most, at whose places a view is looked up."""
 SHOWN = 0.25
