@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from jaxtyping import Float
 from numpy import ndarray as Array
 
@@ -23,9 +22,9 @@ from lang3dxl_ns.common.files import read_json
 from lang3dxl_ns.query.language import HELD, TABLE, held
 from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.query.vocabulary import closest_word, common_words
-from lang3dxl_ns.scene.camera import in_camera_frame
 from lang3dxl_ns.scene.record import ScenePhoto
 from lang3dxl_ns.things.find import MISSED, Things, up_of
+from lang3dxl_ns.things.outlines import shown
 from lang3dxl_ns.things.thing import Thing
 
 BESIDE = 1.5
@@ -96,17 +95,10 @@ def sight_of(scene: Scene, things: list[Thing], photo: str | None = None) -> Sig
 
 
 def _shown(scene: Scene, photo: ScenePhoto, things: list[Thing]) -> frozenset[int]:
-    """List the things that were found in a photo, or whose middle it shows: held-out photos find none."""
-    camera = photo.camera
-    depth, lens = scene.draw(camera).depth.cpu().numpy(), camera.intrinsics.cpu().numpy()
-    shown = {thing.id for thing in things for seen in thing.sightings if seen.photo == photo.name}
-    for thing in things:
-        (seen,) = in_camera_frame(camera, torch.from_numpy(thing.center[None])).cpu().numpy()
-        x, y = (lens[:2] @ seen / max(seen[2], 1e-9)).astype(int)
-        inside = seen[2] > 0 and 0 <= x < camera.width and 0 <= y < camera.height
-        if inside and seen[2] < depth[y, x] + thing.size[:2].max():
-            shown.add(thing.id)
-    return frozenset(shown)
+    """List the things that a photo shows, whether they were found in it or not."""
+    words = {thing.word: [other for other in things if other.word == thing.word] for thing in things}
+    seen = (shown(scene.splats, photo.camera, of_word) for of_word in words.values())
+    return frozenset(thing.id for found in seen for _, thing, _ in found)
 
 
 Facing = Callable[[list[Thing]], Sight]

@@ -145,7 +145,7 @@ export class List extends EventTarget {
     if (!asked.every(Boolean)) return null;
     for (const [k, word] of words.entries()) found[word] = await this.find(asked[k]);
     const things = Object.fromEntries(words.map((word) => [word, found[word].things])), own = things[request.word];
-    const view = this.sight(Object.values(found)), chosen = answerTo(request, things, view), [first] = asked, every = chosen.length === own.length;
+    const view = await this.sight(Object.values(found)), chosen = answerTo(request, things, view), [first] = asked, every = chosen.length === own.length;
     Object.assign(first, { listed: true, asked: every ? null : new Set(chosen.map(({ id }) => id)) });
     const sure = asked.every(({ trust }) => trust.level === "sure" && !trust.far) ? "" : " Not sure: see the cards.";
     const doubt = request.count && every ? null : unsure(request, found, view, shown), several = assumed(request, things, view, shown);
@@ -161,12 +161,11 @@ export class List extends EventTarget {
     return (chosen.length > MOST_NUMBERS ? `${chosen.length} of ${own.length} ${name}.` : `${name} number${chosen.length > 1 ? "s" : ""} ${numbers}.`) + note;
   }
 
-  /** Directions of the viewer, right, up and ahead, and the ids of the things whose middle lies in the window. */
-  sight(found) {
-    const up = new Vector3(...this.about.up), ahead = this.view.camera.getWorldDirection(new Vector3()), { clientWidth, clientHeight } = this.view.frame;
+  /** Directions of the viewer, right, up and ahead, and the ids of the things that the view shows. */
+  async sight(found) {
+    const up = new Vector3(...this.about.up), ahead = this.view.camera.getWorldDirection(new Vector3());
     ahead.addScaledVector(up, -ahead.dot(up)).normalize();
-    const inside = ([x, y]) => x >= 0 && x < clientWidth && y >= 0 && y < clientHeight, every = found.flatMap(({ things, candidates }) => [...things, ...candidates]);
-    const shown = new Set(every.filter(({ center }) => inside(this.view.pixel(center) ?? [-1, -1])).map(({ id }) => id));
+    const shown = new Set((await this.inView(found.map(({ things, candidates }) => [...things, ...candidates]))).map(({ id }) => id));
     return { right: ahead.clone().cross(up).toArray(), up: up.toArray(), ahead: ahead.toArray(), shown };
   }
 
@@ -179,10 +178,15 @@ export class List extends EventTarget {
 
   /** Find which things the view shows. Resolves to whether it is still the same view. */
   async look() {
-    const turn = (this.turn = {}), lists = this.open.map(({ found }) => found.things);
-    const found = lists.length ? await this.think("shown", { camera: this.view.picking, lists: lists.map((things) => things.map(({ rows }) => rows)) }) : [];
-    if (turn === this.turn) this.visible = new Set(lists.flatMap((things, k) => things.filter((_, t) => found[k][t])));
+    const turn = (this.turn = {}), shown = await this.inView(this.open.map(({ found }) => found.things));
+    if (turn === this.turn) this.visible = new Set(shown);
     return turn === this.turn;
+  }
+
+  /** Those of several lists of things that the view shows. */
+  async inView(lists) {
+    const shown = lists.length ? await this.think("shown", { camera: this.view.picking, lists: lists.map((things) => things.map(({ rows }) => rows)) }) : [];
+    return lists.flatMap((things, k) => things.filter((_, t) => shown[k][t]));
   }
 
   /** Draw the boxes of the lists that are open, with numbers that don't overlap: of what the view shows, and of the chosen

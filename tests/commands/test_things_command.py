@@ -75,7 +75,6 @@ def test_left_is_told_within_the_photo_that_one_names(ask):
         ask("third window from the left", view=name)
 
 
-
 def test_one_table_is_printed_and_written_and_labels_have_one_category_for_a_word(ask, tmp_path):
     lines = ask("leftmost window", text=["windows", "dome"], out=tmp_path)
     start = next(i for i, line in enumerate(lines) if line.startswith("number"))
