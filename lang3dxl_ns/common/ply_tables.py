@@ -112,7 +112,10 @@ def _ascii_columns(file: BinaryIO, before: list[Table], vertices: Table, last: b
     columns = vertices.columns
     if vertices.lists:
         raise UserError(f"its points hold lists {next(iter(vertices.lists))} as text: export it as binary")
-    numbers = np.fromstring(file.read().decode("latin-1"), sep=" ")
+    try:
+        numbers = np.fromstring(file.read().decode("latin-1"), sep=" ")
+    except ValueError as error:  # before 2.3, numpy reads up to there
+        raise ValueError("it holds something else than numbers") from error
     skipped = sum(table.length * len(table.columns) for table in before)
     expected = vertices.length * len(columns)
     found = len(numbers) - skipped

@@ -436,6 +436,7 @@ def ring(count=9):
     return tilted @ np.stack([right, np.cross(back, right), back, places + np.array([1.0, 2, 0])], axis=2)
 
 
+@pytest.mark.nerfstudio
 @pytest.mark.parametrize("orientation", ["up", "vertical", "none"])
 @pytest.mark.parametrize("center", ["poses", "none"])
 def test_the_frame_is_nerfstudios(orientation, center):
