@@ -15,6 +15,7 @@ import torch
 from PIL import Image
 from scipy.ndimage import find_objects
 
+from lang3dxl_ns.common.console import tracked
 from lang3dxl_ns.common.files import make_folder, slugs, write_atomically
 from lang3dxl_ns.files.coco import CocoLabels
 from lang3dxl_ns.files.glb import encode_glb
@@ -108,7 +109,7 @@ def coco(scene: Scene, answers: Sequence[Things]) -> dict[str, Any]:
     """Label all things in all photos that show six pixels of them, in pixels of the photos' files, as COCO's
     content."""
     labels = CocoLabels([one.word for one in answers])
-    for photo in scene.photos:
+    for photo in tracked(scene.photos, "labels of photos"):
         labels.add_photo(photo.name, photo.file_size)
         for category, one in enumerate(answers, start=1):
             numbers = held(scene.splats, photo.camera, one.things)
