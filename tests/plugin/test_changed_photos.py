@@ -43,7 +43,8 @@ def test_photos_that_change_sides_are_told_on_resume(train, tmp_path, capsys):
     capsys.readouterr()
     train(data, 3, semantics=False, load_dir=first.checkpoint_dir, **held_out(tmp_path, "photo_005"))
     said = " ".join(capsys.readouterr().out.split())
-    assert "2 photos are on the other side" in said and "photo_000.jpg, photo_005.jpg" in said
+    assert "2 photos moved between the training and held-out sets" in said
+    assert "photo_000.jpg, photo_005.jpg" in said
 
 
 def test_corrections_of_cameras_are_not_given_to_other_photos(train, tmp_path):
