@@ -30,6 +30,8 @@ from runs import train_run
 from scenes import write_scene
 from tiny_models import make_tiny_clip, make_tiny_dinov2
 
+from lang3dxl_ns.common.errors import NO_NERFSTUDIO
+
 # No test may contact a model hub.
 os.environ["HF_HUB_OFFLINE"] = "1"
 # A thread per process where several test at a time: more would wait for each other. Commands inherit it.
@@ -87,7 +89,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             if {"train", "two_steps"} & set(getattr(item, "fixturenames", ())) or item.get_closest_marker(
                 "nerfstudio"
             ):
-                item.add_marker(pytest.mark.skip(reason="needs nerfstudio: pip install -e '.[nerfstudio]'"))
+                item.add_marker(pytest.mark.skip(reason=NO_NERFSTUDIO))
     slow = Counter(item.path for item in items if item.get_closest_marker("slow"))
     items.sort(key=lambda item: -slow[item.path])
 

@@ -36,14 +36,15 @@ class Placements:
     """Distance from which a photo is wrong, as a share of the cameras' extent."""
 
 
-def wrong_photos(true: Path, found: Path, share: float) -> tuple[set[str], set[str]]:
-    """Names of the photos with a pose, and of those among them that stand wrong."""
+def wrong_photos(true: Path, found: Path, share: float) -> tuple[dict[str, float], set[str]]:
+    """Distances of the photos with a pose from their true places, as shares of the cameras' extent, and the
+    names of those that stand wrong."""
     truth, model = ({i.name: i for i in pycolmap.Reconstruction(p).images.values()} for p in (true, found))
     names = sorted(name for name, image in model.items() if image.has_pose and name in truth)
     places = np.array([model[name].projection_center() for name in names])
     wanted = np.array([truth[name].projection_center() for name in names])
     extent = 2 * np.linalg.norm(wanted - wanted.mean(0), axis=1).max()
-    _, right = ransac(
+    aligned, right = ransac(
         (places, wanted),
         SimilarityTransform,
         min_samples=4,
@@ -51,14 +52,17 @@ def wrong_photos(true: Path, found: Path, share: float) -> tuple[set[str], set[s
         max_trials=4_000,
         rng=0,
     )
-    return set(names), {name for name, stands in zip(names, right, strict=True) if not stands}
+    off = np.linalg.norm(aligned(places) - wanted, axis=1) / extent
+    wrong = {name for name, stands in zip(names, right, strict=True) if not stands}
+    return dict(zip(names, off.tolist(), strict=True)), wrong
 
 
 def main(config: Placements) -> None:
-    posed, wrong = wrong_photos(config.true, config.found, config.share)
+    off, wrong = wrong_photos(config.true, config.found, config.share)
     doubtful = set(json.loads(config.report.read_text())["doubtful"])
     both = wrong & doubtful
-    print(f"{len(posed)} with a pose, {len(wrong)} wrong, {len(doubtful)} doubtful, {len(both)} both")
+    print(f"{len(off)} with a pose, {len(wrong)} wrong, {len(doubtful)} doubtful, {len(both)} both")
+    print(f"off by {np.median([*off.values()]):.3%} of the extent (median), at most {max(off.values()):.1%}")
 
 
 if __name__ == "__main__":

@@ -20,5 +20,6 @@ def test_a_moved_photo_is_wrong_in_any_frame(tmp_path, scale):
     found.transform(pycolmap.Sim3d(scale, turn, np.array([1.0, 2.0, 3.0])))
     (tmp_path / "found").mkdir()
     found.write(tmp_path / "found")
-    posed, wrong = wrong_photos(model, tmp_path / "found", 0.05)
-    assert len(posed) == 12 and wrong == {"photo_004.jpg"}
+    off, wrong = wrong_photos(model, tmp_path / "found", 0.05)
+    assert len(off) == 12 and wrong == {"photo_004.jpg"}
+    assert {name for name, distance in off.items() if distance > 1e-3} == wrong

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -34,9 +33,9 @@ class ListThings(OfScene):
 
     def main(self) -> None:
         from lang3dxl_ns.open_scene import load_scene
-        from lang3dxl_ns.query.ask import Text, prompts_of
+        from lang3dxl_ns.query.ask import prompts_of
         from lang3dxl_ns.query.text import Prompt, caution
-        from lang3dxl_ns.things.grammar import in_words, meant, parse, sight_of
+        from lang3dxl_ns.things.grammar import Request, in_words, meant, parse, sight_of
         from lang3dxl_ns.things.write import each_word_once, table, write_catalog, write_picture, write_things
 
         if not (self.text or self.ask):
@@ -46,11 +45,15 @@ class ListThings(OfScene):
         scene = load_scene(self.scene, clip=self.clip)
         if self.view is not None:
             scene.file.photo(self.view)
-        texts: list[Text] = list(self.text)
-        for text in self.ask:
-            with suppress(UserError):  # which is told below
-                texts += map(Prompt, parse(text, scene.words).words)
-        prompts = list(dict.fromkeys(prompts_of(scene, texts) if texts else ()))
+        requests, refused = dict[str, Request](), list[str]()
+        for text in dict.fromkeys(self.ask):
+            try:
+                requests[text] = parse(text, scene.words)
+            except UserError as error:
+                refused.append(_refusal(text, error))
+        asked = [Prompt(word) for request in requests.values() for word in request.words]
+        own = dict.fromkeys(prompts_of(scene, self.text) if self.text else ())
+        prompts = list(own | dict.fromkeys(prompts_of(scene, asked) if asked else ()))
         answers = scene.things(prompts) if prompts else []
         by_word = {p.text: one for p, one in zip(prompts, answers, strict=True) if not p.negatives}
         for prompt, one in zip(prompts, answers, strict=True):
@@ -59,20 +62,17 @@ class ListThings(OfScene):
                 other = meant(one.word, scene.words)
                 advice = caution(one.word), other and f"did you mean {other}?"
                 say(*(f"  {line}" for line in advice if line))
-        own = set(prompts_of(scene, self.text)) if self.text else set()
-        named = [one for prompt, one in zip(prompts, answers, strict=True) if prompt in own]
+        named = each_word_once(answers[: len(own)])
         if any(one.things for one in named):
-            say(*table(scene, each_word_once(named)))
+            say(*table(scene, named))
         every = [thing for one in answers for thing in (*one.things, *one.candidates)]
         seen = None if self.view is None else sight_of(scene, every, self.view)
-        refused = []
-        for text in dict.fromkeys(self.ask):
+        for text, request in requests.items():
             try:
-                request = parse(text, scene.words)
                 found = [by_word[word] for word in request.words]
                 say(f"{text}: {in_words(request, found, lambda things: seen or sight_of(scene, things))}")
             except UserError as error:
-                refused.append(str(error) if str(error).startswith(text) else f"{text}: {error}")
+                refused.append(_refusal(text, error))
         if self.out is not None and answers:
             listed = each_word_once(answers)
             write_catalog(scene, listed, self.out)
@@ -83,3 +83,8 @@ class ListThings(OfScene):
         if not self.text and len(refused) == len({*self.ask}):
             raise UserError("; ".join(refused))
         say(*refused)
+
+
+def _refusal(question: str, error: UserError) -> str:
+    """Say why a question has no answer, with the question unless the reason begins with it."""
+    return str(error) if str(error).startswith(question) else f"{question}: {error}"

@@ -387,7 +387,7 @@ class Scene:
 
     def things(self, texts: Text | Sequence[Text]) -> list[Things]:
         """Find the single things that each prompt of `texts` (see `ask`) names: windows, portals, towers."""
-        from lang3dxl_ns.things.find import things_of  # scipy's parts take a tenth of the time to open a file
+        from lang3dxl_ns.things.find import things_of  # whose scipy opening does not need
 
         return things_of(self, self.ask(texts))
 

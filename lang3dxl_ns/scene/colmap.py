@@ -121,7 +121,7 @@ def photos_in_model(model_dir: Path) -> int:
 def _tracked_photo(
     photo: ModelPhoto, files: ModelFiles, rows: dict[int, int], positions: Float[Array, "m 3"]
 ) -> TrackedPhoto:
-    from scipy.spatial.transform import Rotation  # a tenth of the time in which a scene file opens
+    from scipy.spatial.transform import Rotation  # which opening a scene file does not need
 
     camera = files.cameras.get(photo.camera)
     if camera is None:

@@ -101,7 +101,7 @@ def _apart(centers: Float[Array, "n 3"], points: Float[Array, "m 3"]) -> bool:
 
 def turned_to(direction: Float[Array, "3"], target: tuple[int, int, int]) -> Float64[Array, "3 3"]:
     """Compute the smallest rotation that takes a direction to another; the identity for a zero vector."""
-    from scipy.spatial.transform import Rotation  # a tenth of the time in which a scene file opens
+    from scipy.spatial.transform import Rotation  # which opening a scene file does not need
 
     length = float(np.linalg.norm(direction))
     if length < 1e-12:

@@ -41,19 +41,24 @@ def numbered(answers: Sequence[Things]) -> list[tuple[int, int, Thing]]:
 
 
 @torch.no_grad()
-def held(splats: Splats, camera: Camera, things: Sequence[Thing]) -> Int[Array, "h w"]:
-    """Tell for each pixel of a view the number, from 1, of the thing that it shows; 0 for none. The `things`
-    are those of one word, which share no Gaussians."""
-    numbers = np.zeros(len(splats), int)
-    for number, thing in enumerate(things, start=1):
-        numbers[thing.rows] = number
-    # A pixel's number has the bits that most of the light from things has: a few channels for many things.
-    bits = np.arange(len(things).bit_length())
-    channels = np.column_stack([numbers > 0, numbers[:, None] >> bits & 1])
-    drawn = composite(splats, camera, torch.from_numpy(channels).to(splats.means))
-    light, *ones = np.moveaxis(drawn.cpu().numpy(), 2, 0)
-    found = sum((one > light / 2).astype(int) << bit for bit, one in zip(bits, ones, strict=True))
-    return np.where(light > LIGHT, found, 0)
+def held(splats: Splats, camera: Camera, words: Sequence[Sequence[Thing]]) -> list[Int[Array, "h w"]]:
+    """Tell for each word and pixel of a view the number, from 1, of the thing that it shows; 0 for none. The
+    things of one word share no Gaussians."""
+    channels = []
+    for things in words:
+        numbers = np.zeros(len(splats), int)
+        for number, thing in enumerate(things, start=1):
+            numbers[thing.rows] = number
+        # A pixel's number has the bits that most of the light from things has: few channels for many things.
+        bits = np.arange(len(things).bit_length())
+        channels.append(np.column_stack([numbers > 0, numbers[:, None] >> bits & 1]))
+    drawn = composite(splats, camera, torch.from_numpy(np.hstack(channels)).to(splats.means)).cpu().numpy()
+    maps = []
+    for part in np.split(drawn, np.cumsum([one.shape[1] for one in channels])[:-1], axis=2):
+        light, ones = part[..., 0], part[..., 1:]
+        found = ((ones > light[..., None] / 2) << np.arange(ones.shape[2])).sum(2)
+        maps.append(np.where(light > LIGHT, found, 0))
+    return maps
 
 
 def shown(
@@ -61,7 +66,7 @@ def shown(
 ) -> Iterator[tuple[int, Thing, tuple[int, int]]]:
     """Yield the things of one word that a view shows, each with its number and the middle of its pixels
     (column and row): those that it shows at a quarter of the places of some of their Gaussians."""
-    pixels = held(splats, camera, things)
+    (pixels,) = held(splats, camera, [things])
     lens = camera.intrinsics.cpu().numpy()
     for number, thing in enumerate(things, start=1):
         rows = np.sort(thing.rows)[:: 1 + (len(thing.rows) - 1) // PLACES]

@@ -111,8 +111,8 @@ def coco(scene: Scene, answers: Sequence[Things]) -> dict[str, Any]:
     labels = CocoLabels([one.word for one in answers])
     for photo in tracked(scene.photos, "labels of photos"):
         labels.add_photo(photo.name, photo.file_size)
-        for category, one in enumerate(answers, start=1):
-            numbers = held(scene.splats, photo.camera, one.things)
+        maps = held(scene.splats, photo.camera, [one.things for one in answers])
+        for category, (one, numbers) in enumerate(zip(answers, maps, strict=True), start=1):
             zoom = np.divide(photo.file_size[::-1], numbers.shape)
             places = find_objects(numbers, len(one.things))
             for number, (thing, place) in enumerate(zip(one.things, places, strict=True), start=1):

@@ -1,4 +1,4 @@
-"""Laws of things: pieces, joining, boxes and questions, on scenes that are drawn by hand."""
+"""Laws of things: pieces, joining, boxes, outlines and files, on scenes that are drawn by hand."""
 
 import csv
 import json
@@ -9,27 +9,21 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from made_things import thing
 from painted_scene import WINDOWS, painted_file, painted_scene
 
-from lab.benchmarks.questions import Known, ask_all, in_words, questions
-from lab.benchmarks.things import Score, pooled_f1
-from lab.landmark.instances import true_things
-from lab.landmark.landmark import Landmark
-from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.query.trust import FAR
 from lang3dxl_ns.rendering import Camera, Rendering, Splats
 from lang3dxl_ns.scene.camera import in_camera_frame
 from lang3dxl_ns.scene.georeference import Georeference
 from lang3dxl_ns.things.find import PRESENT, Things, axes_of, heights_of, things_of, up_of
-from lang3dxl_ns.things.grammar import Request, Sight, answer, assumed, meant, parse, sight_of, table, unsure
+from lang3dxl_ns.things.grammar import sight_of
 from lang3dxl_ns.things.join import OFTEN, Joined, grown, join, placed, without_crumbs
 from lang3dxl_ns.things.outlines import outlined
 from lang3dxl_ns.things.pieces import Piece, Shown, pieces_of, split
-from lang3dxl_ns.things.thing import Thing, upright_box
+from lang3dxl_ns.things.thing import upright_box
 from lang3dxl_ns.things.write import coco, write_catalog
 from lang3dxl_ns.words.taught_words import mask_of
-
-SIGHT = Sight(np.array([1.0, 0, 0]), np.array([0, 0, 1.0]), np.array([0, 1.0, 0]))
 
 
 def bumps(*columns: int) -> np.ndarray:
@@ -46,11 +40,6 @@ def joined(pieces, places=range(300)) -> list[Joined]:
     """Join pieces of Gaussians of equal weight at these places along x."""
     points, weight = np.outer(places, (1.0, 0, 0)), np.ones(len(places))
     return join(pieces, weight, lambda one: upright_box(points[one.rows], weight[one.rows], np.eye(3)))
-
-
-def thing(number: int, word: str, center, size=(1.0, 1.0, 1.0), views: int = 3) -> Thing:
-    rows = np.array([number])
-    return Thing(number, word, 1.0, views, np.array(center, float), np.eye(3), np.array(size, float), rows)
 
 
 def test_a_region_splits_where_it_falls_apart_and_only_there():
@@ -169,187 +158,6 @@ def test_boxes_stand_along_the_walls(angle):
     center, _, size = upright_box(flat[0] @ walls, np.ones(2000), walls)
     assert center == pytest.approx(walls.T @ (5, 0.5, 4.5), abs=0.2)
     assert size == pytest.approx([9.4, 0.94, 8.5], abs=0.3)
-
-
-@pytest.mark.parametrize(
-    ("text", "request_"),
-    [
-        ("how many windows are there?", Request("windows", count=True)),
-        ("highest tower", Request("tower", superlative="highest")),
-        ("the third window from the left", Request("window", nth=3, along="left")),
-        ("third window on the left", Request("window", nth=3, along="left")),
-        ("windows left of the portal", Request("windows", relation="left", others=(Request("portal"),))),
-        (
-            "the window between the portals",
-            Request("window", relation="between", others=(Request("portals"),)),
-        ),
-        ("count windows not doors", Request("windows", count=True, without="doors")),
-        ("rose window", Request("rose window")),
-        (
-            "largest window above the portal",
-            Request("window", superlative="largest", relation="above", others=(Request("portal"),)),
-        ),
-        (
-            "how many windows on the left tower",
-            Request("windows", True, relation="in", others=(Request("tower", superlative="left"),)),
-        ),
-        (
-            "windows above the second door from the left",
-            Request("windows", relation="above", others=(Request("door", nth=2, along="left"),)),
-        ),
-        ("second highest tower", Request("tower", superlative="highest", nth=2)),
-        ("3rd window from left", Request("window", nth=3, along="left")),
-        ('how many "Statue on the roof"', Request("Statue on the roof", count=True)),
-        ("how many “doors and gates” not 'a' door", Request("doors and gates", True, without="'a' door")),
-        ('"top" windows above the "left gate"',
-         Request("top windows", relation="above", others=(Request("left gate"),))),
-    ],
-)  # fmt: skip
-def test_questions_are_read(text, request_):
-    assert parse(text) == request_
-
-
-@pytest.mark.parametrize("typed", ["statue on the roof", "Statue On the Roof", '"statue on the roof"'])
-def test_taught_names_and_quotes_hold_a_phrase(typed):
-    names, word = ["Statue on the roof", "1"], typed.strip('"')
-    assert parse(f"how many {typed}", names) == Request(word, count=True)
-    assert parse(f"windows above the second {typed} from the left", names).others[0].word == word
-    assert parse(f'"big window" on 1 not {typed}', names).without == word
-    assert parse("statue on the roofs", names).relation == "in"
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        *("third window", "windows from the left", "windows between the a and b and c", ""),
-        *("left of the door", "windows on the second tower", "windows on"),
-        *("tallest two towers", "top window", "gate 3", "0th window from the left", "doors, towers"),
-        *("third window from the left side", "windows; doors", "two windows above the portal"),
-        *("second highest tower from the left", "windows on the right", "leftmost window from the right"),
-    ],
-)
-def test_what_the_grammar_does_not_know_is_said(text):
-    with pytest.raises(UserError):
-        parse(text)
-
-
-def test_advice_is_a_sentence_whatever_was_typed():
-    def said(text: str) -> str:
-        with pytest.raises(UserError) as told:
-            parse(text)
-        return str(told.value)
-
-    assert (
-        said("windows on the right")
-        == "windows on the right: say which one, such as the second from the right"
-    )
-    assert said("3rd window").endswith("such as the 3rd window from the left")
-    assert "can't use from, left" in said("3rd window from the left side")
-    assert said('windows near the "left gate"').startswith(
-        "windows near the left gate: a question can't use near"
-    )
-
-
-def test_a_misspelled_beginning_is_guessed_and_a_word_is_not():
-    assert meant("higest tower") == "highest tower"
-    assert meant("thrid window") == "third window"
-    for name in ("highest", "red tower", "light tower", "rose window", "windows", "tower"):
-        assert meant(name) is None
-
-
-def test_questions_choose_by_place_and_size_and_mirror_with_the_viewer():
-    row = [thing(i, "window", (x, 0, 5)) for i, x in enumerate([3, 0, 9, 6])]
-    portal = thing(9, "portal", (4.5, 0, 0), (2, 1, 4))
-    found = [Things("window", row), Things("portal", [portal])]
-    mirrored = Sight(-SIGHT.right, SIGHT.up, SIGHT.ahead)
-
-    def ids(text: str, sight: Sight = SIGHT) -> list[int]:
-        return [one.id for one in answer(parse(text), found, lambda _: sight)]
-
-    assert ids("second window from the left") == [0]
-    assert ids("second window from the right") == ids("second window from the left", mirrored) == [3]
-    assert ids("leftmost window") == [1] != ids("leftmost window", mirrored)
-    assert ids("window left of the portal") == ids("window right of the portal", mirrored) == [0, 1]
-    assert ids("window above the portal") == [0, 1, 2, 3]
-    assert ids("window below the portal") == []
-    assert ids("portal below the leftmost window") == ids("portal left of the rightmost window") == [9]
-    assert ids("portal left of the leftmost window") == []
-    assert ids("window left of the right window") == [0, 1, 3]
-    assert ids("second highest window") == ids("second largest window") == [1]  # in their order
-    with pytest.raises(UserError, match="only 4"):
-        ids("fifth window from the left")
-    with pytest.raises(UserError, match="only 1"):
-        ids("second highest portal")
-
-
-def test_left_and_right_are_told_among_what_the_view_shows():
-    row = [thing(i, "window", (x, 0, 5)) for i, x in enumerate([3, 0, 9, 6])]
-    found, near = [Things("window", row)], replace(SIGHT, shown=frozenset({0, 3}))
-
-    def ids(text: str) -> list[int]:
-        return [one.id for one in answer(parse(text), found, lambda _: near)]
-
-    assert ids("leftmost window") == ids("second window from the right") == [0]
-    assert ids("rightmost window") == ids("second window from the left") == [3]
-    assert ids("window right of the leftmost window") == [2, 3]
-    assert ids("highest window") == ids("first window from the top") == [0]  # wherever one stands
-    for text in ("third window from the left", "third leftmost window"):
-        with pytest.raises(UserError, match="only 2 found in this view"):
-            ids(text)
-    near = replace(SIGHT, shown=frozenset())
-    with pytest.raises(UserError, match="none found in this view"):
-        ids("leftmost window")
-
-
-def test_left_and_right_in_a_photo_are_told_among_what_it_shows():
-    plain = painted_file()
-    first = plain.photos[0]
-    turned = [[-row[0], row[1], -row[2], row[3]] for row in first.camera_to_world]
-    away = replace(first, name="away.jpg", camera_to_world=turned)
-    scene = painted_scene(file=replace(plain, photos=[*plain.photos, away]))
-    windows = scene.things("windows")[0].things
-    assert sight_of(scene, windows, first.name).shown == {one.id for one in windows}
-    # Whether it was found in a photo, as in none of those that were held out, makes no difference.
-    nowhere = [replace(one, sightings=[]) for one in windows]
-    assert sight_of(scene, nowhere, first.name).shown == {one.id for one in windows}
-    assert sight_of(scene, windows, away.name).shown == frozenset()
-    assert sight_of(scene, windows).shown is None
-
-
-def test_a_relation_to_several_things_tells_that_any_counts():
-    gates = [thing(i, "gate", (x, 0, 0)) for i, x in enumerate([0, 4, 8])]
-    found = [Things("window", [thing(9, "window", (2, 0, 0))]), Things("gate", gates)]
-
-    def told(text: str, some=found) -> str:
-        return assumed(parse(text), some, lambda _: SIGHT)
-
-    assert told("window left of the gate") == "gate: 3 found, any of them counts"
-    assert told("window left of the leftmost gate") == told("leftmost window") == ""
-    assert told("window between the gates", [found[0], Things("gates", gates)]) != ""
-    assert told("window between the gates", [found[0], Things("gates", gates[:2])]) == ""
-
-
-def test_every_phrase_of_the_table_is_reached():
-    words = table()
-    for phrase in words["relations"]:
-        other = "doors and gates" if phrase == "between" else "doors"
-        assert parse(f"windows {phrase} {other}").relation == words["relations"][phrase]
-    for phrase in words["superlatives"]:
-        assert parse(f"{phrase} tower").superlative == phrase
-
-
-@pytest.mark.parametrize(("family", "seed"), [("cathedral", 600), ("mosque", 602), ("hall", 604)])
-def test_true_things_hold_each_solid_once(family, seed):
-    landmark = Landmark.from_seed(seed, family)
-    things, numbers = true_things(landmark)
-    held = np.concatenate(numbers)
-    assert set(held.tolist()) == set(range(len(things)))
-    for shape, own in zip(landmark.shapes, numbers, strict=True):
-        corners = shape.corners
-        for number in own.tolist():
-            center = things[number].center
-            margin = things[number].size.max()
-            assert (center > corners.min(0) - margin).all() and (center < corners.max(0) + margin).all()
 
 
 def test_a_thing_keeps_its_id_in_later_questions_and_under_other_words():
@@ -536,115 +344,6 @@ def test_strays_do_not_move_the_ground():
     moved = painted_scene(splats=replace(scene.splats, means=means))
     vars(moved)["mass"] = scene.mass  # photos show them
     np.testing.assert_allclose(heights_of(moved), (ground, top), atol=0.02 * (top - ground))
-
-
-def test_generated_questions_are_right_where_all_is_found_and_tell_what_is_missed():
-    scene = painted_scene()
-    rng = np.random.default_rng(0)
-    true = [thing(i, "window", rng.uniform(0, 9, 3), rng.uniform(0.5, 2, 3)) for i in range(5)]
-    true += [thing(9, "portal", (4.5, 0, 0), (2, 1, 4))]
-
-    def outcomes(missed: int):
-        known = {}
-        for word in ("window", "portal"):
-            own = [one for one in true if one.word == word]
-            found = [one for one in own if one.id != missed]
-            candidates = [one for one in own if one not in found]
-            known[word] = Known(Things(word, found, candidates), own, {one: one for one in found})
-        return ask_all(scene, known)
-
-    every = outcomes(missed=-1)
-    assert len(every) > 50
-    assert all(one.right and one.right_if_found for one in every)
-    doubted = (*SIZES, "how many", "window ")  # sizes are rough, and lists of windows may lack one
-    assert not any(one.cautious for one in every if not one.question.startswith(doubted))
-    some = outcomes(missed=2)
-    assert all(one.right_if_found for one in some if not one.question.startswith("how many"))
-    assert 0 < sum(one.right for one in some) < len(some)
-    # Where the one that was missed is a candidate, no answer that it would change comes without a caution.
-    assert all(one.cautious for one in some if not one.right)
-    assert sum(one.cautious for one in some if one.right) < sum(one.right for one in some) / 2
-
-
-def test_generated_questions_use_every_relation_and_ask_for_what_is_not_there():
-    asked = [parse(text) for text in questions(["window", "portal", "tower"])]
-    assert {one.relation for one in asked} == {None, *table()["relations"].values()}
-    assert any(one.without for one in asked) and any(len(one.others) == 2 for one in asked)
-    true, spire = (
-        [thing(i, "window", (i, 0, 5), views=9) for i in range(3)],
-        thing(8, "spire", (9, 0, 9), views=9),
-    )
-
-    def absent(*spires: Thing):
-        known = {
-            "window": Known(Things("window", true), true, {one: one for one in true}),
-            "spire": Known(Things("spire", list(spires)), [], {}),
-        }
-        outcomes = ask_all(painted_scene(), known)
-        assert "0 questions" not in in_words(outcomes)
-        return [one for one in outcomes if one.absent], in_words(outcomes)
-
-    right, told = absent()
-    assert len(right) > 3 and all(one.right for one in right)
-    assert f"not there: {len(right)} questions: 100% right" in told
-    wrong, told = absent(spire)
-    assert not any(one.right or one.cautious for one in wrong)
-    assert f"not there: {len(wrong)} questions: 0% right, 100% wrong without a caution" in told
-
-
-def test_false_things_count_where_a_word_has_no_true_one():
-    counted = (9, 9, 9), ()
-    rows = [Score("mosque", "minarets", 9, 9, 0, *counted), Score("hall", "minarets", 0, 0, 4, *counted)]
-    assert pooled_f1(rows) == pytest.approx(18 / 22)
-    assert pooled_f1(rows[:1]) == 1 and pooled_f1(rows[1:]) == 0 and pooled_f1([]) is None
-
-
-SIZES = ("tallest", "shortest", "largest", "biggest", "smallest", "widest", "narrowest")
-
-
-def test_a_relation_that_its_things_places_leave_open_counts_either_way():
-    scene, portal = painted_scene(), thing(9, "portal", (0, 0, 0), (2, 1, 4))
-    up = up_of(scene)
-    for height, open_ in ((2.1, True), (9.0, False)):
-        true = thing(1, "window", height * up)
-        found = thing(1, "window", 1.9 * up)  # its center is below the portal's top
-        known = {
-            "window": Known(Things("window", [found]), [true], {found: true}),
-            "portal": Known(Things("portal", [portal]), [portal], {portal: portal}),
-        }
-        outcomes = {one.question: one for one in ask_all(scene, known)}
-        assert outcomes["window above the portal"].right is open_
-
-
-def test_an_answer_has_a_caution_if_doubt_would_change_it():
-    windows = [thing(i, "window", (x, 0, 0), (1 + x, 1, 1 + x), views=9) for i, x in enumerate((0, 3, 6))]
-    portal = thing(9, "portal", (0, 0, -9), views=9)
-    rare, perhaps = thing(5, "window", (9, 0, 0), views=2), thing(6, "window", (-4, 0, 5), views=1)
-
-    def caution(text: str, things, candidates=()) -> str | None:
-        found = [Things("window", things, list(candidates)), Things("portal", [portal])]
-        return unsure(parse(text), found, lambda _: SIGHT)
-
-    assert caution("leftmost window", windows) is None
-    assert caution("leftmost window", windows, [perhaps]) == "window: 3, perhaps 3 to 4"
-    assert caution("rightmost window", windows, [perhaps]) is None
-    assert caution("rightmost window", [*windows, rare]) == "window: 4, perhaps 3 to 5"
-    assert caution("second window from the left", [*windows, rare]) is None
-    assert caution("fourth window from the left", [*windows, rare]) == "window: 4, perhaps 3 to 5"
-    assert caution("window above the portal", windows) == "window: 3, perhaps 3 to 4"  # as their count
-    assert caution("window above the portal", windows[:2]) is None
-    assert caution("window above the portal", windows[:2], [perhaps])
-    assert caution("leftmost window above the portal", windows) is None
-    assert caution("window below the portal", windows, [perhaps]) is None
-    assert caution("largest window", windows) is None
-    assert caution("portal below the largest window", windows) is None
-    assert caution("portal below the largest window", [*windows, thing(4, "window", (0, 0, 0), (6, 1, 7), 9)])
-    assert caution("largest window", [*windows, thing(4, "window", (0, 0, 0), (6, 1, 7), views=9)])
-    assert caution("third largest window", [*windows, thing(4, "window", (0, 0, 0), (6, 1, 7), 9)]) is None
-    assert "nearly" in caution(
-        "second largest window", [*windows, thing(4, "window", (0, 0, 0), (6, 1, 7), 9)]
-    )
-    assert caution("highest window", [*windows, thing(4, "window", (0, 0, 0), (6, 1, 7), views=9)]) is None
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,209 @@
+"""Questions about things: read, answered, refused, and doubted."""
+
+from dataclasses import replace
+
+import pytest
+from made_things import SIGHT, thing
+from painted_scene import painted_file, painted_scene
+
+from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.things.find import Things
+from lang3dxl_ns.things.grammar import Request, Sight, answer, assumed, meant, parse, sight_of, table, unsure
+
+
+@pytest.mark.parametrize(
+    ("text", "request_"),
+    [
+        ("how many windows are there?", Request("windows", count=True)),
+        ("highest tower", Request("tower", superlative="highest")),
+        ("the third window from the left", Request("window", nth=3, along="left")),
+        ("third window on the left", Request("window", nth=3, along="left")),
+        ("windows left of the portal", Request("windows", relation="left", others=(Request("portal"),))),
+        (
+            "the window between the portals",
+            Request("window", relation="between", others=(Request("portals"),)),
+        ),
+        ("count windows not doors", Request("windows", count=True, without="doors")),
+        ("rose window", Request("rose window")),
+        (
+            "largest window above the portal",
+            Request("window", superlative="largest", relation="above", others=(Request("portal"),)),
+        ),
+        (
+            "how many windows on the left tower",
+            Request("windows", True, relation="in", others=(Request("tower", superlative="left"),)),
+        ),
+        (
+            "windows above the second door from the left",
+            Request("windows", relation="above", others=(Request("door", nth=2, along="left"),)),
+        ),
+        ("second highest tower", Request("tower", superlative="highest", nth=2)),
+        ("3rd window from left", Request("window", nth=3, along="left")),
+        ('how many "Statue on the roof"', Request("Statue on the roof", count=True)),
+        ("how many “doors and gates” not 'a' door", Request("doors and gates", True, without="'a' door")),
+        ('"top" windows above the "left gate"',
+         Request("top windows", relation="above", others=(Request("left gate"),))),
+    ],
+)  # fmt: skip
+def test_questions_are_read(text, request_):
+    assert parse(text) == request_
+
+
+@pytest.mark.parametrize("typed", ["statue on the roof", "Statue On the Roof", '"statue on the roof"'])
+def test_taught_names_and_quotes_hold_a_phrase(typed):
+    names, word = ["Statue on the roof", "1"], typed.strip('"')
+    assert parse(f"how many {typed}", names) == Request(word, count=True)
+    assert parse(f"windows above the second {typed} from the left", names).others[0].word == word
+    assert parse(f'"big window" on 1 not {typed}', names).without == word
+    assert parse("statue on the roofs", names).relation == "in"
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        *("third window", "windows from the left", "windows between the a and b and c", ""),
+        *("left of the door", "windows on the second tower", "windows on"),
+        *("tallest two towers", "top window", "gate 3", "0th window from the left", "doors, towers"),
+        *("third window from the left side", "windows; doors", "two windows above the portal"),
+        *("second highest tower from the left", "windows on the right", "leftmost window from the right"),
+    ],
+)
+def test_what_the_grammar_does_not_know_is_said(text):
+    with pytest.raises(UserError):
+        parse(text)
+
+
+def test_advice_is_a_sentence_whatever_was_typed():
+    def said(text: str) -> str:
+        with pytest.raises(UserError) as told:
+            parse(text)
+        return str(told.value)
+
+    assert (
+        said("windows on the right")
+        == "windows on the right: say which one, such as the second from the right"
+    )
+    assert said("3rd window").endswith("such as the 3rd window from the left")
+    assert "can't use from, left" in said("3rd window from the left side")
+    assert said('windows near the "left gate"').startswith(
+        "windows near the left gate: a question can't use near"
+    )
+
+
+def test_a_misspelled_beginning_is_guessed_and_a_word_is_not():
+    assert meant("higest tower") == "highest tower"
+    assert meant("thrid window") == "third window"
+    for name in ("highest", "red tower", "light tower", "rose window", "windows", "tower"):
+        assert meant(name) is None
+
+
+def test_questions_choose_by_place_and_size_and_mirror_with_the_viewer():
+    row = [thing(i, "window", (x, 0, 5)) for i, x in enumerate([3, 0, 9, 6])]
+    portal = thing(9, "portal", (4.5, 0, 0), (2, 1, 4))
+    found = [Things("window", row), Things("portal", [portal])]
+    mirrored = Sight(-SIGHT.right, SIGHT.up, SIGHT.ahead)
+
+    def ids(text: str, sight: Sight = SIGHT) -> list[int]:
+        return [one.id for one in answer(parse(text), found, lambda _: sight)]
+
+    assert ids("second window from the left") == [0]
+    assert ids("second window from the right") == ids("second window from the left", mirrored) == [3]
+    assert ids("leftmost window") == [1] != ids("leftmost window", mirrored)
+    assert ids("window left of the portal") == ids("window right of the portal", mirrored) == [0, 1]
+    assert ids("window above the portal") == [0, 1, 2, 3]
+    assert ids("window below the portal") == []
+    assert ids("portal below the leftmost window") == ids("portal left of the rightmost window") == [9]
+    assert ids("portal left of the leftmost window") == []
+    assert ids("window left of the right window") == [0, 1, 3]
+    assert ids("second highest window") == ids("second largest window") == [1]  # in their order
+    with pytest.raises(UserError, match="only 4"):
+        ids("fifth window from the left")
+    with pytest.raises(UserError, match="only 1"):
+        ids("second highest portal")
+
+
+def test_left_and_right_are_told_among_what_the_view_shows():
+    row = [thing(i, "window", (x, 0, 5)) for i, x in enumerate([3, 0, 9, 6])]
+    found, near = [Things("window", row)], replace(SIGHT, shown=frozenset({0, 3}))
+
+    def ids(text: str) -> list[int]:
+        return [one.id for one in answer(parse(text), found, lambda _: near)]
+
+    assert ids("leftmost window") == ids("second window from the right") == [0]
+    assert ids("rightmost window") == ids("second window from the left") == [3]
+    assert ids("window right of the leftmost window") == [2, 3]
+    assert ids("highest window") == ids("first window from the top") == [0]  # wherever one stands
+    for text in ("third window from the left", "third leftmost window"):
+        with pytest.raises(UserError, match="only 2 found in this view"):
+            ids(text)
+    near = replace(SIGHT, shown=frozenset())
+    with pytest.raises(UserError, match="none found in this view"):
+        ids("leftmost window")
+
+
+def test_left_and_right_in_a_photo_are_told_among_what_it_shows():
+    plain = painted_file()
+    first = plain.photos[0]
+    turned = [[-row[0], row[1], -row[2], row[3]] for row in first.camera_to_world]
+    away = replace(first, name="away.jpg", camera_to_world=turned)
+    scene = painted_scene(file=replace(plain, photos=[*plain.photos, away]))
+    windows = scene.things("windows")[0].things
+    assert sight_of(scene, windows, first.name).shown == {one.id for one in windows}
+    # Whether it was found in a photo, as in none of those that were held out, makes no difference.
+    nowhere = [replace(one, sightings=[]) for one in windows]
+    assert sight_of(scene, nowhere, first.name).shown == {one.id for one in windows}
+    assert sight_of(scene, windows, away.name).shown == frozenset()
+    assert sight_of(scene, windows).shown is None
+
+
+def test_a_relation_to_several_things_tells_that_any_counts():
+    gates = [thing(i, "gate", (x, 0, 0)) for i, x in enumerate([0, 4, 8])]
+    found = [Things("window", [thing(9, "window", (2, 0, 0))]), Things("gate", gates)]
+
+    def told(text: str, some=found) -> str:
+        return assumed(parse(text), some, lambda _: SIGHT)
+
+    assert told("window left of the gate") == "gate: 3 found, any of them counts"
+    assert told("window left of the leftmost gate") == told("leftmost window") == ""
+    assert told("window between the gates", [found[0], Things("gates", gates)]) != ""
+    assert told("window between the gates", [found[0], Things("gates", gates[:2])]) == ""
+
+
+def test_every_phrase_of_the_table_is_reached():
+    words = table()
+    for phrase in words["relations"]:
+        other = "doors and gates" if phrase == "between" else "doors"
+        assert parse(f"windows {phrase} {other}").relation == words["relations"][phrase]
+    for phrase in words["superlatives"]:
+        assert parse(f"{phrase} tower").superlative == phrase
+
+
+def test_an_answer_has_a_caution_if_doubt_would_change_it():
+    windows = [thing(i, "window", (x, 0, 0), (1 + x, 1, 1 + x), views=9) for i, x in enumerate((0, 3, 6))]
+    portal = thing(9, "portal", (0, 0, -9), views=9)
+    rare, perhaps = thing(5, "window", (9, 0, 0), views=2), thing(6, "window", (-4, 0, 5), views=1)
+
+    def caution(text: str, things, candidates=()) -> str | None:
+        found = [Things("window", things, list(candidates)), Things("portal", [portal])]
+        return unsure(parse(text), found, lambda _: SIGHT)
+
+    assert caution("leftmost window", windows) is None
+    assert caution("leftmost window", windows, [perhaps]) == "window: 3, perhaps 3 to 4"
+    assert caution("rightmost window", windows, [perhaps]) is None
+    assert caution("rightmost window", [*windows, rare]) == "window: 4, perhaps 3 to 5"
+    assert caution("second window from the left", [*windows, rare]) is None
+    assert caution("fourth window from the left", [*windows, rare]) == "window: 4, perhaps 3 to 5"
+    assert caution("window above the portal", windows) == "window: 3, perhaps 3 to 4"  # as their count
+    assert caution("window above the portal", windows[:2]) is None
+    assert caution("window above the portal", windows[:2], [perhaps])
+    assert caution("leftmost window above the portal", windows) is None
+    assert caution("window below the portal", windows, [perhaps]) is None
+    assert caution("largest window", windows) is None
+    assert caution("portal below the largest window", windows) is None
+    assert caution("portal below the largest window", [*windows, thing(4, "window", (0, 0, 0), (6, 1, 7), 9)])
+    assert caution("largest window", [*windows, thing(4, "window", (0, 0, 0), (6, 1, 7), views=9)])
+    assert caution("third largest window", [*windows, thing(4, "window", (0, 0, 0), (6, 1, 7), 9)]) is None
+    assert "nearly" in caution(
+        "second largest window", [*windows, thing(4, "window", (0, 0, 0), (6, 1, 7), 9)]
+    )
+    assert caution("highest window", [*windows, thing(4, "window", (0, 0, 0), (6, 1, 7), views=9)]) is None
