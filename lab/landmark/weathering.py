@@ -19,6 +19,7 @@ _SIZES = (7.1, 3.3, 1.45, 0.62, 0.27, 0.12, 0.053, 0.023)
 """Sizes of stains and grain, meters; about an octave apart, without a common multiple."""
 _CONTRAST = 0.32
 """Range of the reflectance that every size adds: walls have about equal contrast in every octave."""
+_BLOCK = 1 << 15  # points at once, whose arrays stay in the processor's cache
 _TINT = 0.12, 0.7
 """Range of brightness between copies of a wall, and between windows (curtains, lamps, reflections)."""
 
@@ -27,15 +28,18 @@ def stains(at: Float[Array, "n 3"], footprint: Float[Array, " n"], seed: int) ->
     """Compute factors on the reflectance at points of the world (meters), whose pixels have this footprint
     (meters)."""
     factor, table = np.ones(len(at), np.float32), _noise_table()
-    for octave, size in enumerate(_SIZES):
-        share = resolved(size, footprint)
-        shown = np.flatnonzero(share)
-        if not len(shown):
-            break
-        cells = (at[shown] * np.float32(_SAMPLES / size)).astype(np.int32) + 53 * (seed + 7 * octave)
-        x, y, z = (cells & (_PERIODS * _SAMPLES - 1)).T
-        value = table.take((x * table.shape[0] + y) * table.shape[0] + z).astype(np.float32) / 255 - 0.5
-        factor[shown] += np.float32(_CONTRAST) * value * share[shown]
+    period = len(table)
+    added = ((np.arange(256) / 255 - 0.5) * _CONTRAST).astype(np.float32)
+    for start in range(0, len(at), _BLOCK):
+        run = slice(start, start + _BLOCK)
+        columns, pixel, total = np.ascontiguousarray(at[run].T), footprint[run], factor[run]
+        for octave, size in enumerate(_SIZES):
+            share = resolved(size, pixel)
+            if not share.any():
+                break
+            cells = (columns * np.float32(_SAMPLES / size)).astype(np.int32) + 53 * (seed + 7 * octave)
+            x, y, z = cells & (period - 1)
+            total += share * added.take(table.take((x * period + y) * period + z))
     return np.maximum(factor, 0.2)
 
 
