@@ -13,7 +13,7 @@ import shutil
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -88,6 +88,8 @@ def add_photos(
     """
     settings = settings or ReconstructionSettings()
     check_settings(settings)
+    if settings.features == "auto":
+        settings = replace(settings, features="sift")
     if settings.mapper != "incremental":
         raise UserError("--add places photos without a mapper: leave out --mapper")
     data, folder = expanded(data).absolute(), expanded(folder).absolute()
@@ -102,13 +104,13 @@ def add_photos(
     with locked(adding, busy=f"another command adds photos in {adding}: wait for it, or end it"), quiet():
         good, left_out = usable(PhotoFolder(images, (*old, *targets)))
         copies = numbered(good, adding)
-        database = feature_database(good, copies, adding, settings)
+        database = feature_database(good, copies, adding, settings, (work, work / "dsp-sift"))
         extract(database, copies, settings)
         number = dict(zip(good.names, copies.names, strict=True))
         model = load_pycolmap().Reconstruction(place)
         new = {number[name] for name in targets if name in number}
         known = {(number[a], number[b]) for a, b in _pairs_of(model) if a in number and b in number}
-        match(database, copies.names, settings, new, known)
+        match(database, copies, settings, new, known)
         with load_pycolmap().Database.open(database) as db:
             ids = {name: db.read_image_with_name(number[name]).image_id for name in good.names}
             scene = _Scene(model, db, {ids[name]: name for name in good.names}, good)

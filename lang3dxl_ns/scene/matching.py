@@ -11,7 +11,7 @@ import os
 import shutil
 from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import UInt8
 from numpy import ndarray as Array
 
-from lang3dxl_ns.common.console import progress
+from lang3dxl_ns.common.console import progress, say
 from lang3dxl_ns.common.errors import DAMAGE, is_plain
 from lang3dxl_ns.common.files import read_json, replace_file
 from lang3dxl_ns.common.memory import machine_memory
@@ -27,7 +27,7 @@ from lang3dxl_ns.common.pictures import open_picture
 from lang3dxl_ns.scene.colmap import load_pycolmap
 from lang3dxl_ns.scene.learned_features import LearnedMatcher, extract_learned
 from lang3dxl_ns.scene.pairing import ROUNDS, pairs_that_share, pairs_to_match
-from lang3dxl_ns.scene.photo_folder import PhotoFolder, find_photos, readable, shared_cameras
+from lang3dxl_ns.scene.photo_folder import PhotoFolder, find_photos, readable, shared_cameras, walks
 from lang3dxl_ns.scene.placements import LEAST_MATCHES
 from lang3dxl_ns.scene.reconstruction import ReconstructionSettings
 
@@ -45,12 +45,12 @@ _STAMP = "photos.json"
 def usable(photos: PhotoFolder) -> tuple[PhotoFolder, dict[str, str]]:
     """Separate the readable photos, without duplicate files, from the others, for which reasons are given."""
     good, left_out = readable(photos)
-    first: dict[bytes, str] = {}
+    first: dict[str, str] = {}
     for name in good.names:
         if not is_plain(name):  # a COLMAP model can't hold it
             left_out[name] = "its name is not plain text: rename the file"
             continue
-        content = hashlib.blake2b((photos.folder / name).read_bytes()).digest()
+        content = _digest(photos.folder / name)
         if first.setdefault(content, name) != name:
             left_out[name] = f"the same file as {first[content]}"
     return PhotoFolder(photos.folder, tuple(first.values())), left_out
@@ -81,14 +81,21 @@ def numbered(photos: PhotoFolder, work: Path) -> PhotoFolder:
 
 
 def feature_database(
-    photos: PhotoFolder, copies: PhotoFolder, work: Path, settings: ReconstructionSettings
+    photos: PhotoFolder,
+    copies: PhotoFolder,
+    work: Path,
+    settings: ReconstructionSettings,
+    earlier: Sequence[Path] = (),
 ) -> Path:
-    """Make the database of photos and cameras, or reuse one with the same photos and settings."""
+    """Make the database of photos and cameras, or reuse one with the same photos and settings.
+
+    A new one has the features of the photos whose bytes an older database knows, here or in the folders
+    `earlier`."""
     pycolmap = load_pycolmap()
-    states = [(photos.folder / name).stat() for name in photos.names]
+    told = [(n, (photos.folder / n).stat().st_size, _digest(photos.folder / n)) for n in photos.names]
     stamp = json.dumps(
         {
-            "photos": [[n, s.st_size, s.st_mtime_ns] for n, s in zip(photos.names, states, strict=True)],
+            "photos": told,
             "settings": [settings.max_size, settings.max_features, settings.one_camera, copies.names],
             "features": settings.features,
         }
@@ -96,9 +103,9 @@ def feature_database(
     database, stamped = work / "database.db", work / _STAMP
     if database.is_file() and stamped.is_file() and stamped.read_text() == stamp:
         return database
-    for old in (stamped, *work.glob("database.db*"), *work.glob("importing.db*"), *work.glob("xfeat/*")):
-        old.unlink(missing_ok=True)
     importing = work / "importing.db"
+    for old in work.glob("importing.db*"):
+        old.unlink()
     pycolmap.Database.open(importing).close()
     groups = shared_cameras(photos)
     if settings.one_camera is not None:
@@ -107,9 +114,40 @@ def feature_database(
     for group in groups:
         numbers = [number[name] for name in group]
         pycolmap.import_images(importing, copies.folder, pycolmap.CameraMode.SINGLE, numbers)
+    wanted = {content: number[name] for name, _, content in told}
+    for folder in (work, *earlier):
+        _keep_features(folder, importing, wanted, settings)
+    if earlier:
+        found = f"{len(told) - len(wanted)} of {len(told)} photos"
+        say(f"{found} have features in the cache, made with the same settings; the others are read")
+    for old in (stamped, *work.glob("database.db*"), *work.glob("xfeat/*")):
+        old.unlink(missing_ok=True)
     importing.rename(database)
     replace_file(stamped, stamp)
     return database
+
+
+def _keep_features(
+    folder: Path, database: Path, wanted: dict[str, str], settings: ReconstructionSettings
+) -> None:
+    """Copy features from the database in a folder to a new one, if they were made with the same settings.
+    Learned ones stay behind. `wanted` maps the digests of photos to their names, and loses what is found."""
+    open_database = load_pycolmap().Database.open
+    with suppress(*DAMAGE), open_database(database) as new:
+        told = read_json(folder / _STAMP)
+        made = told["features"], *told["settings"][:2]
+        known = dict(zip((content for *_, content in told["photos"]), told["settings"][3], strict=True))
+        same = made == (settings.features, settings.max_size, settings.max_features) and made[0] != "xfeat"
+        if not same or not (folder / "database.db").is_file():
+            return
+        with open_database(folder / "database.db") as old:
+            for content in known.keys() & wanted:
+                source = old.read_image_with_name(known[content]).image_id
+                target = new.read_image_with_name(wanted[content]).image_id
+                if old.exists_descriptors(source):
+                    new.write_descriptors(target, old.read_descriptors(source))
+                    new.write_keypoints(target, old.read_keypoints(source))  # last: `extract` looks for them
+                    del wanted[content]
 
 
 def extract(database: Path, photos: PhotoFolder, settings: ReconstructionSettings) -> None:
@@ -138,7 +176,7 @@ def extract(database: Path, photos: PhotoFolder, settings: ReconstructionSetting
 
 def match(
     database: Path,
-    names: Sequence[str],
+    photos: PhotoFolder,
     settings: ReconstructionSettings,
     new: Collection[str] | None = None,
     matched: Collection[tuple[str, str]] = (),
@@ -147,21 +185,26 @@ def match(
 
     Args:
         database: COLMAP's database with the photos' features.
-        names: the photos, in the order of a walk where there is one.
+        photos: the photos, by their names in the database.
         settings: as for `reconstruct`.
         new: photos of which each pair must have one; all by default.
         matched: pairs of other photos that are known to match.
     """
-    new = set(names if new is None else new)
+    new = set(photos.names if new is None else new)
     with load_pycolmap().Database.open(database) as db:
         ids = {image.name: image.image_id for image in db.read_all_images()}
-        known = sorted(n for n in names if n in ids and db.num_keypoints_for_image(ids[n]))
+        known = sorted(n for n in photos.names if n in ids and db.num_keypoints_for_image(ids[n]))
+        new.intersection_update(known)
         learned = LearnedMatcher(database, known) if settings.features == "xfeat" else None
-        pairs = learned.pairs() if learned else pairs_to_match(known, lambda name: largest(db, ids[name]))
+        if learned:
+            pairs = learned.pairs()
+        else:
+            in_time = walks(PhotoFolder(photos.folder, tuple(known)))
+            pairs = pairs_to_match(known, lambda name: largest(db, ids[name]), new, in_time)
     tried: set[tuple[str, str]] = set()
     for further in range(1 if learned else 1 + ROUNDS):
         if further:  # without what an interrupted attempt also tried, with which other pairs would share most
-            pairs = pairs_that_share(known, tried, (tried & _matched(database)).union(matched))
+            pairs = pairs_that_share(known, tried.union(matched), (tried & _matched(database)).union(matched))
         _match_pairs(database, [pair for pair in pairs if not new.isdisjoint(pair)], settings, learned)
         tried.update(pairs)
 
@@ -232,6 +275,10 @@ def quiet() -> Iterator[None]:
         yield
     finally:
         logging.minloglevel = level
+
+
+def _digest(path: Path) -> str:
+    return hashlib.blake2b(path.read_bytes(), digest_size=16).hexdigest()
 
 
 def _threads(memory_each: float) -> int:

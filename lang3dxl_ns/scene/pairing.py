@@ -3,7 +3,7 @@ those that match the same others."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from itertools import combinations
 
 import numpy as np
@@ -29,25 +29,32 @@ Descriptors = Callable[[str], UInt8[Array, "n 128"]]
 """Function from a photo's name to the SIFT descriptors of its features, the largest first."""
 
 
-def pairs_to_match(names: Sequence[str], descriptors: Descriptors) -> list[tuple[str, str]]:
-    """List the pairs to begin with: all of up to `EXHAUSTIVE` photos; of more, those of `similar_pairs`, and
-    neighbors in name order, which is the order of a video or a walk."""
+def pairs_to_match(
+    names: Sequence[str], descriptors: Descriptors, new: Collection[str], walks: Iterable[Sequence[str]]
+) -> list[tuple[str, str]]:
+    """List the pairs to begin with: all of up to `EXHAUSTIVE` photos; of more, `similar_pairs` of the new
+    ones, and neighbors in the order of names, as of a video, and of each walk."""
     if len(names) <= EXHAUSTIVE:
         return list(combinations(names, 2))
-    found = set(similar_pairs(names, descriptors, ALIKE))
-    for apart in (1, 2, 4, 8):
-        found.update(zip(names[:-apart], names[apart:], strict=True))
+    found = set(similar_pairs(names, descriptors, ALIKE, new))
+    for walk in (names, *walks):
+        for apart in (1, 2, 4, 8):
+            found.update((min(pair), max(pair)) for pair in zip(walk[:-apart], walk[apart:], strict=True))
     return sorted(found)
 
 
-def similar_pairs(names: Sequence[str], descriptors: Descriptors, neighbors: int) -> list[tuple[str, str]]:
-    """Pair each photo with the `neighbors` photos in which most of its largest features have a match
+def similar_pairs(
+    names: Sequence[str], descriptors: Descriptors, neighbors: int, new: Collection[str]
+) -> list[tuple[str, str]]:
+    """Pair each new photo with the `neighbors` photos in which most of its largest features have a match
     (preemptive matching, Wu 2013)."""
+    names = sorted(names, key=lambda name: name not in new)  # the new ones first
     rows = torch.stack([_rows(descriptors(name)) for name in names])
-    counts = np.zeros((len(names), len(names)), dtype=int)
-    with progress("photos compared", len(names)) as advance:
-        for i in range(len(names)):
-            counts[i, i + 1 :] = counts[i + 1 :, i] = _possible_matches(rows[i], rows[i + 1 :])
+    counts = np.zeros((len(new), len(names)), dtype=int)
+    with progress("photos compared", len(new)) as advance:
+        for i in range(len(new)):
+            counts[i, i + 1 :] = _possible_matches(rows[i], rows[i + 1 :])
+            counts[i + 1 :, i] = counts[i, i + 1 : len(new)]
             advance(1)
     return _best_pairs(names, counts, neighbors)
 
@@ -65,11 +72,11 @@ def pairs_that_share(
     return _best_pairs(names, (matches @ matches * ~done).astype(int), SHARING)
 
 
-def _best_pairs(names: Sequence[str], scores: Int[Array, "n n"], count: int) -> list[tuple[str, str]]:
-    """Pair each photo with the `count` of the highest positive score."""
+def _best_pairs(names: Sequence[str], scores: Int[Array, "m n"], count: int) -> list[tuple[str, str]]:
+    """Pair each of the first m photos with the `count` of the highest positive score."""
     best = np.argsort(-scores, axis=1, kind="stable")[:, :count]
     found = ((i, j) for i, others in enumerate(best.tolist()) for j in others if scores[i, j] > 0)
-    return sorted({(names[min(pair)], names[max(pair)]) for pair in found})
+    return sorted({(min(names[i], names[j]), max(names[i], names[j])) for i, j in found})
 
 
 def _rows(descriptors: UInt8[Array, "n 128"]) -> Float[Tensor, "m 128"]:
@@ -89,8 +96,7 @@ def _possible_matches(photo: Float[Tensor, "m 128"], others: Float[Tensor, "k m 
         second = cosines.scatter_(2, where[..., None], -1.0).amax(2)
         clear = 1 - nearest < _CLEARLY**2 * (1 - second)
         found = torch.zeros(len(some), len(photo) + 1)
-        found.scatter_(
-            1, torch.where(clear, where, len(photo)).T, 1.0
-        )  # the last column takes the unclear ones
+        # The last column takes the unclear ones.
+        found.scatter_(1, torch.where(clear, where, len(photo)).T, 1.0)
         counts.append(found[:, :-1].sum(1))
     return torch.cat(counts).int().numpy() if counts else np.zeros(0, dtype=int)

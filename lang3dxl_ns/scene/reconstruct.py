@@ -166,7 +166,7 @@ def _mapping(
         database = feature_database(photos, copies, work, settings)
         extract(database, copies, settings)
     with timed(spent, "matching"):
-        match(database, copies.names, settings)
+        match(database, copies, settings)
     with timed(spent, "mapping"):
         models = _map(database, copies, work, settings.mapper)
         pairs = _measured_pairs(database, models)

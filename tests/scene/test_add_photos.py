@@ -1,6 +1,7 @@
 """New photos for a model: they find their places, and nothing of the model moves or is lost."""
 
 import json
+import os
 import shutil
 from dataclasses import replace
 
@@ -146,6 +147,64 @@ def test_the_report_counts_each_photo_once_however_often_it_is_added(scene):
         assert set(told["left_out"]) == {"late/noise.jpg"}
         assert told["photos"] == number + 1
         shutil.copy(scene / LATE[1], scene / "late")
+
+
+@pytest.fixture
+def extracted(monkeypatch):
+    """Numbers of the photos whose features are extracted."""
+    numbers, extract = [], pycolmap.extract_features
+
+    def noted(database, folder, names, **options):
+        numbers.extend(int(name[:6]) for name in names)
+        extract(database, folder, names, **options)
+
+    monkeypatch.setattr(pycolmap, "extract_features", noted)
+    return numbers
+
+
+def test_features_of_the_first_reconstruction_are_kept_and_change_nothing(scene, extracted, capsys):
+    shutil.copytree(scene, scene / "anew")
+    shutil.rmtree(scene / "anew/data/lang3dxl_cache")
+    with_kept = contents(add_photos(scene / "data", scene / "late", None, SIFT))
+    assert extracted == [5, 6]
+    assert "5 of 7 photos have features in the cache" in capsys.readouterr().out
+    extracted.clear()
+    assert contents(add_photos(scene / "anew/data", scene / "anew/late", None, SIFT)) == with_kept
+    assert extracted == [0, 1, 2, 3, 4, 5, 6]
+    assert "0 of 7 photos have features in the cache" in capsys.readouterr().out
+
+
+def test_features_of_a_photo_that_was_changed_are_extracted_anew(scene, extracted):
+    changed = scene / "data/images/photo_001.jpg"
+    content, time = bytearray(changed.read_bytes()), changed.stat().st_mtime_ns
+    content[15] ^= 1  # its resolution, in dots per inch
+    changed.write_bytes(content)
+    os.utime(changed, ns=(time, time))
+    add_photos(scene / "data", scene / "late", None, SIFT)
+    assert extracted == [1, 5, 6]
+
+
+def test_features_by_other_settings_are_not_taken(scene, extracted):
+    add_photos(scene / "data", scene / "late", None, replace(SIFT, max_features=3000))
+    assert extracted == [0, 1, 2, 3, 4, 5, 6]
+
+
+def test_photos_that_were_added_keep_their_features_for_the_next(scene, extracted):
+    shutil.move(scene / "late" / LATE[1], scene / LATE[1])
+    add_photos(scene / "data", scene / "late", None, SIFT)
+    shutil.move(scene / LATE[1], scene / "late")
+    extracted.clear()
+    add_photos(scene / "data", scene / "late", None, ReconstructionSettings())
+    assert extracted == [6]
+
+
+def test_a_damaged_database_of_features_is_as_good_as_none(scene, extracted):
+    database = scene / "data/lang3dxl_cache/reconstruction/database.db"
+    for path in database.parent.glob("database.db*"):
+        path.unlink()
+    database.write_bytes(b"no database" * 1000)
+    add_photos(scene / "data", scene / "late", None, SIFT)
+    assert extracted == [0, 1, 2, 3, 4, 5, 6]
 
 
 def test_photos_that_share_points_are_pairs(made):

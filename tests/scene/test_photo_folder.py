@@ -9,7 +9,7 @@ from PIL import ExifTags, Image
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.scene import pairing
 from lang3dxl_ns.scene.pairing import pairs_that_share, pairs_to_match, similar_pairs
-from lang3dxl_ns.scene.photo_folder import find_photos, readable, shared_cameras
+from lang3dxl_ns.scene.photo_folder import find_photos, readable, shared_cameras, walks
 
 
 def put(path, size=(8, 6), body=None, focal=None):
@@ -105,7 +105,7 @@ def test_exif_tells_cameras_and_zooms_apart(tmp_path):
 
 
 def test_few_photos_are_matched_all_with_all():
-    assert pairs_to_match(["a", "b", "c"], None) == [("a", "b"), ("a", "c"), ("b", "c")]
+    assert pairs_to_match(["a", "b", "c"], None, "abc", []) == [("a", "b"), ("a", "c"), ("b", "c")]
 
 
 def test_similar_photos_find_each_other():
@@ -117,9 +117,12 @@ def test_similar_photos_find_each_other():
         name: (places[int(name) % 4] + rng.normal(0, 20, (60, 128))).clip(0, 255).astype(np.uint8)
         for name in names
     }
-    pairs = similar_pairs(sorted(names), described.__getitem__, 5)
+    pairs = similar_pairs(sorted(names), described.__getitem__, 5, names)
     assert {(int(a) - int(b)) % 4 for a, b in pairs} == {0}
     assert len(pairs) == 4 * 15
+    new = {"11", "22"}
+    found = similar_pairs(sorted(names), described.__getitem__, 5, new)
+    assert found == [pair for pair in pairs if not new.isdisjoint(pair)]
 
 
 def test_photos_that_match_the_same_one_are_paired_unless_they_were():
@@ -131,7 +134,7 @@ def test_photos_that_match_the_same_one_are_paired_unless_they_were():
 def test_photos_without_features_look_like_no_other():
     same = np.random.default_rng(0).integers(0, 255, (60, 128), dtype=np.uint8)
     described = {"a": same, "b": same[:0], "c": same, "d": same[:0]}
-    assert similar_pairs("abcd", described.__getitem__, 5) == [("a", "c")]
+    assert similar_pairs("abcd", described.__getitem__, 5, "abcd") == [("a", "c")]
 
 
 def test_large_collections_are_matched_with_neighbors_alone(monkeypatch):
@@ -139,9 +142,33 @@ def test_large_collections_are_matched_with_neighbors_alone(monkeypatch):
     rng = np.random.default_rng(0)
     names = [f"{i:03d}" for i in range(60)]
     described = {name: rng.integers(0, 255, (20, 128), dtype=np.uint8) for name in names}
-    pairs = pairs_to_match(names, described.__getitem__)
+    walk = [names[i] for i in rng.permutation(60)[:12]]
+    pairs = pairs_to_match(names, described.__getitem__, names, [walk])
     assert len(set(pairs)) == len(pairs) < 60 * (20 + 4)
     assert set(pairwise(names)) <= set(pairs)
+    assert {tuple(sorted(pair)) for pair in pairwise(walk)} <= set(pairs)
+
+
+def test_a_walk_is_what_one_camera_took_without_a_long_break(tmp_path):
+    """Whatever the names; a clock that stands still or a damaged time says nothing of others' photos."""
+    taken = {
+        "z.jpg": ("X", "2026:05:01 10:00:00", "2"),
+        "y.jpg": ("X", "2026:05:01 10:00:00", "15"),
+        "a.jpg": ("X", "2026:05:01 10:09:00", None),
+        "late.jpg": ("X", "2026:05:01 10:30:00", None),
+        "other.jpg": ("Y", "2026:05:01 10:00:01", None),
+        "bad.jpg": ("X", "0000:00:00 00:00:00", None),
+        "silent.jpg": (None, "2026:05:01 10:00:02", None),
+        "timeless.jpg": ("X", None, None),
+    }
+    for name, (model, time, fraction) in taken.items():
+        exif = Image.Exif()
+        told = {ExifTags.Base.DateTimeOriginal: time, ExifTags.Base.SubsecTimeOriginal: fraction}
+        if model:
+            exif[ExifTags.Base.Model] = model
+        exif.get_ifd(ExifTags.IFD.Exif).update({tag: value for tag, value in told.items() if value})
+        Image.new("RGB", (8, 6)).save(tmp_path / name, exif=exif)
+    assert walks(find_photos(tmp_path)) == [["y.jpg", "z.jpg", "a.jpg"], ["late.jpg"], ["other.jpg"]]
 
 
 @pytest.mark.parametrize("suffix", [".jpg", ".png", ".webp", ".tif", ".bmp", ".gif"])
