@@ -87,19 +87,14 @@ def feature_database(
     settings: ReconstructionSettings,
     earlier: Sequence[Path] = (),
 ) -> Path:
-    """Make the database of photos and cameras, or reuse one with the same photos and settings.
-
-    A new one has the features of the photos whose bytes an older database knows, here or in the folders
-    `earlier`."""
+    """Make the database of photos and cameras, or reuse one with the same photos and settings. A new one has
+    the features of photos whose bytes an older one knows, here or in the folders `earlier`."""
     pycolmap = load_pycolmap()
-    told = [(n, (photos.folder / n).stat().st_size, _digest(photos.folder / n)) for n in photos.names]
-    stamp = json.dumps(
-        {
-            "photos": told,
-            "settings": [settings.max_size, settings.max_features, settings.one_camera, copies.names],
-            "features": settings.features,
-        }
-    )
+    number = dict(zip(photos.names, copies.names, strict=True))
+    paths = {name: photos.folder / name for name in photos.names}
+    told = [(name, path.stat().st_size, _digest(path), number[name]) for name, path in paths.items()]
+    made = [settings.features, settings.max_size, settings.max_features]
+    stamp = json.dumps({"photos": told, "features": made, "one_camera": settings.one_camera})
     database, stamped = work / "database.db", work / _STAMP
     if database.is_file() and stamped.is_file() and stamped.read_text() == stamp:
         return database
@@ -110,16 +105,14 @@ def feature_database(
     groups = shared_cameras(photos)
     if settings.one_camera is not None:
         groups = [list(photos.names)] if settings.one_camera else [[name] for name in photos.names]
-    number = dict(zip(photos.names, copies.names, strict=True))
     for group in groups:
         numbers = [number[name] for name in group]
         pycolmap.import_images(importing, copies.folder, pycolmap.CameraMode.SINGLE, numbers)
-    wanted = {content: number[name] for name, _, content in told}
+    wanted = {content: name for *_, content, name in told}
     for folder in (work, *earlier):
-        _keep_features(folder, importing, wanted, settings)
+        _keep_features(folder, importing, wanted, made)
     if earlier:
-        found = f"{len(told) - len(wanted)} of {len(told)} photos"
-        say(f"{found} have features in the cache, made with the same settings; the others are read")
+        say(f"features of {len(told) - len(wanted)} of {len(told)} photos are kept, made with these settings")
     for old in (stamped, *work.glob("database.db*"), *work.glob("xfeat/*")):
         old.unlink(missing_ok=True)
     importing.rename(database)
@@ -127,18 +120,14 @@ def feature_database(
     return database
 
 
-def _keep_features(
-    folder: Path, database: Path, wanted: dict[str, str], settings: ReconstructionSettings
-) -> None:
-    """Copy features from the database in a folder to a new one, if they were made with the same settings.
+def _keep_features(folder: Path, database: Path, wanted: dict[str, str], made: Sequence[str | int]) -> None:
+    """Copy features from the database in a folder to a new one, if they were `made` with the same settings.
     Learned ones stay behind. `wanted` maps the digests of photos to their names, and loses what is found."""
     open_database = load_pycolmap().Database.open
     with suppress(*DAMAGE), open_database(database) as new:
         told = read_json(folder / _STAMP)
-        made = told["features"], *told["settings"][:2]
-        known = dict(zip((content for *_, content in told["photos"]), told["settings"][3], strict=True))
-        same = made == (settings.features, settings.max_size, settings.max_features) and made[0] != "xfeat"
-        if not same or not (folder / "database.db").is_file():
+        known = {content: name for *_, content, name in told["photos"]}
+        if told["features"] != made or "xfeat" in made or not (folder / "database.db").is_file():
             return
         with open_database(folder / "database.db") as old:
             for content in known.keys() & wanted:
@@ -290,7 +279,7 @@ def shows_these(work: Path, data: Path) -> bool:
     """Return whether most photos of the reconstruction in `work` are in the folder `data`, by name and size.
     A cache may be another scene's. The answer is also yes if `work` doesn't tell its photos."""
     try:
-        recorded = {(name, size) for name, size, _ in read_json(work / _STAMP)["photos"]}
+        recorded = {(name, size) for name, size, *_ in read_json(work / _STAMP)["photos"]}
     except DAMAGE:
         return True
     photos = find_photos(data)

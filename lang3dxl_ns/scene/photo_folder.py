@@ -7,7 +7,6 @@ import re
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
-from datetime import datetime, timedelta
 from pathlib import Path
 
 from PIL import ExifTags, Image
@@ -37,8 +36,6 @@ _OWN = re.compile(r"\.[0-9a-f]{16}\.(png|jpg)$")
 """Ends of the names of pictures in a feature store, which --cache-dir may put into the photos' folder."""
 _PHONE_PANORAMA = 6
 """Value that phones give to EXIF's CustomRendered."""
-_BREAK = timedelta(minutes=10)
-"""Time between two photos of a camera after which another walk begins."""
 _WIDEST = 3.0
 """Largest ratio of sides of a photo; stitched panoramas are wider."""
 
@@ -88,26 +85,19 @@ def shared_cameras(photos: PhotoFolder) -> list[list[str]]:
 
 
 def walks(photos: PhotoFolder) -> list[list[str]]:
-    """List the photos that one camera took shortly after each other, in the order of time, by EXIF's maker,
-    model, serial number and times. Photos without a time or model are in no walk."""
-    taken = []
+    """List the photos that one camera took in the same hour, in the order of time, by EXIF's maker, model,
+    serial number and times. Photos without a time or model are in no walk."""
+    taken: dict[tuple, list[tuple[str, str]]] = {}
     for name in photos.names:
         with suppress(Exception), open_picture(photos.folder / name) as image:  # EXIF may hold anything
             exif = image.getexif()
             details = exif.get_ifd(ExifTags.IFD.Exif)
-            fraction = details.get(ExifTags.Base.SubsecTimeOriginal) or "0"
-            told = f"{details[ExifTags.Base.DateTimeOriginal]}.{fraction}"
-            time = datetime.strptime(told, "%Y:%m:%d %H:%M:%S.%f")
             body = exif.get(ExifTags.Base.Make), exif[ExifTags.Base.Model]
-            taken.append((f"{body} {details.get(ExifTags.Base.BodySerialNumber)}", time, name))
-    found: list[list[str]] = []
-    last = "", datetime.min
-    for camera, time, name in sorted(taken):
-        if camera != last[0] or time - last[1] > _BREAK:
-            found.append([])
-        found[-1].append(name)
-        last = camera, time
-    return found
+            time = details[ExifTags.Base.DateTimeOriginal]  # as in 2026:05:01 10:59:30
+            camera = *body, details.get(ExifTags.Base.BodySerialNumber), time[:13]
+            fraction = details.get(ExifTags.Base.SubsecTimeOriginal, "")
+            taken.setdefault(camera, []).append((f"{time}.{fraction}", name))
+    return [[name for _, name in sorted(walk)] for walk in taken.values()]
 
 
 def readable(photos: PhotoFolder) -> tuple[PhotoFolder, dict[str, str]]:

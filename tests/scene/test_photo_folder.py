@@ -137,6 +137,12 @@ def test_photos_without_features_look_like_no_other():
     assert similar_pairs("abcd", described.__getitem__, 5, "abcd") == [("a", "c")]
 
 
+def test_a_photo_finds_the_one_that_finds_another_first():
+    a, b, c = np.random.default_rng(0).integers(0, 255, (3, 60, 128), dtype=np.uint8)
+    described = {"a": a, "b": np.concatenate([a[:20], b[20:]]), "c": np.concatenate([c[:20], a[20:]])}
+    assert similar_pairs("abc", described.__getitem__, 1, "abc") == [("a", "b"), ("a", "c")]
+
+
 def test_large_collections_are_matched_with_neighbors_alone(monkeypatch):
     monkeypatch.setattr(pairing, "EXHAUSTIVE", 20)
     rng = np.random.default_rng(0)
@@ -149,13 +155,13 @@ def test_large_collections_are_matched_with_neighbors_alone(monkeypatch):
     assert {tuple(sorted(pair)) for pair in pairwise(walk)} <= set(pairs)
 
 
-def test_a_walk_is_what_one_camera_took_without_a_long_break(tmp_path):
-    """Whatever the names; a clock that stands still or a damaged time says nothing of others' photos."""
+def test_a_walk_is_what_one_camera_took_in_an_hour(tmp_path):
+    """Whatever the names; a clock that was never set says nothing of others' photos."""
     taken = {
         "z.jpg": ("X", "2026:05:01 10:00:00", "2"),
         "y.jpg": ("X", "2026:05:01 10:00:00", "15"),
         "a.jpg": ("X", "2026:05:01 10:09:00", None),
-        "late.jpg": ("X", "2026:05:01 10:30:00", None),
+        "late.jpg": ("X", "2026:05:02 10:09:01", None),
         "other.jpg": ("Y", "2026:05:01 10:00:01", None),
         "bad.jpg": ("X", "0000:00:00 00:00:00", None),
         "silent.jpg": (None, "2026:05:01 10:00:02", None),
@@ -168,7 +174,12 @@ def test_a_walk_is_what_one_camera_took_without_a_long_break(tmp_path):
             exif[ExifTags.Base.Model] = model
         exif.get_ifd(ExifTags.IFD.Exif).update({tag: value for tag, value in told.items() if value})
         Image.new("RGB", (8, 6)).save(tmp_path / name, exif=exif)
-    assert walks(find_photos(tmp_path)) == [["y.jpg", "z.jpg", "a.jpg"], ["late.jpg"], ["other.jpg"]]
+    assert walks(find_photos(tmp_path)) == [
+        ["y.jpg", "z.jpg", "a.jpg"],
+        ["bad.jpg"],
+        ["late.jpg"],
+        ["other.jpg"],
+    ]
 
 
 @pytest.mark.parametrize("suffix", [".jpg", ".png", ".webp", ".tif", ".bmp", ".gif"])
