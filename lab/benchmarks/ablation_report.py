@@ -1,4 +1,4 @@
-"""Tables and plots of the ablation report."""
+"""Tables of the ablation report."""
 
 from __future__ import annotations
 
@@ -9,9 +9,8 @@ from pathlib import Path
 from statistics import mean, stdev
 from typing import Any
 
-from lab.benchmarks.ablation_rows import BOUNDS, FULL, Row
+from lab.benchmarks.ablation_rows import Row
 from lab.benchmarks.scored_runs import Run
-from lab.reports import as_png
 from lang3dxl_ns.common.files import write_atomically
 from lang3dxl_ns.common.reports import describe_machine, markdown_table, write_report
 
@@ -34,7 +33,7 @@ Figures = Mapping[Run, Mapping[str, float]]
 def write_ablation(
     folder: Path, command: str, rows: Sequence[Row], figures: Figures, failed: Mapping[Run, str]
 ) -> None:
-    """Write ablation.md, .json, .csv and .png from the results so far."""
+    """Write ablation.md, .json and .csv from the results so far."""
     scenes = list(dict.fromkeys(run.label for run in (*figures, *failed)))
     lengths = sorted({run.steps for run in (*figures, *failed)})
     summary = {steps: [_summary(row, steps, scenes, figures, failed) for row in rows] for steps in lengths}
@@ -49,8 +48,6 @@ def write_ablation(
     }
     write_report(folder, "ablation", markdown(data), data)
     write_atomically(folder / "ablation.csv", table_of_runs(figures))
-    if any({"train_seconds", quality} <= set(row["mean"]) for rows in summary.values() for row in rows):
-        write_atomically(folder / "ablation.png", plot(summary, quality))
 
 
 def _summary(
@@ -130,8 +127,6 @@ of any length is as fast and better. "Published" are Lang3D-XL's figures for Hol
 another CLIP, other lengths.
 
 {(chr(10) * 2).join(parts)}
-
-![mAP](ablation.png)
 """ + (f"\n## Not run here\n\n{notes}\n" if notes else "")
 
 
@@ -205,30 +200,3 @@ def table_of_runs(figures: Figures) -> str:
         values = [found.get(name, "") for name in names]
         writer.writerow([run.row.name, run.row.group, run.label, run.steps, run.seed, *values])
     return file.getvalue()
-
-
-def plot(lengths: Mapping[int, Sequence[Mapping[str, Any]]], quality: str) -> bytes:
-    """Plot quality against training time as a PNG: a line per row through its lengths, bounds dotted."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(7, 4.5), layout="constrained")
-    axes = figure.subplots()
-    for index, row in enumerate(next(iter(lengths.values()))):
-        found = [r["mean"] for rows in lengths.values() for r in rows if r["row"] == row["row"]]
-        if row["row"] in BOUNDS:
-            levels = [values[quality]["mean"] for values in found if quality in values]
-            if levels:
-                axes.axhline(mean(levels), color="0.4", linewidth=1, linestyle=":")
-                axes.annotate(row["row"], (1, mean(levels)), xycoords=("axes fraction", "data"), fontsize=7)
-            continue
-        points = [(v["train_seconds"], v[quality]) for v in found if {"train_seconds", quality} <= set(v)]
-        seconds, values = ([p[i]["mean"] for p in points] for i in (0, 1))
-        style = {"color": "C3", "linewidth": 2.5} if row["row"] == FULL else {"color": f"C{index % 10}"}
-        label = row["label"].split(":")[0]
-        axes.errorbar(seconds, values, [p[1]["std"] for p in points], marker="o", label=label, **style)
-    axes.set(xscale="log", xlabel="training, s of one core", ylabel="mAP")
-    axes.xaxis.set_major_formatter("{x:.0f}")
-    axes.xaxis.set_minor_formatter("{x:.0f}")
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.legend(fontsize=7, loc="best")
-    return as_png(figure)

@@ -11,7 +11,7 @@ from lab.benchmarks.scored_runs import (
     Run,
     RunSettings,
     ScoredRuns,
-    in_process_of_its_own,
+    in_own_process,
     run_configuration,
     write_output_to,
 )
@@ -42,7 +42,7 @@ class KeptRuns(ScoredRuns):
             shutil.rmtree(folder / "runs", ignore_errors=True)
             (folder / "scores.json").unlink(missing_ok=True)
             write_atomically(settings, json.dumps(made_with, indent=1) + "\n")
-        return in_process_of_its_own(_train_and_keep, run, self.settings, self.truth, folder, log)
+        return in_own_process(_train_and_keep, run, self.settings, self.truth, folder, log)
 
     def _path(self, run: Run) -> Path:
         return self.kept(run) / "finished.json"

@@ -2,16 +2,28 @@
 
 from __future__ import annotations
 
+import shutil
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from statistics import median
 from tempfile import TemporaryDirectory
+from typing import Any
 
-from lab.benchmarks.chromium import chromium, served
 from lab.reports import command_line
+from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.reports import markdown_table, write_report
 from lang3dxl_ns.common.settings_help import showing
 
+_NAMES = ("chromium", "chromium-browser", "google-chrome")
+_SWITCHES = (
+    *("--headless", "--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader"),
+    *("--enable-unsafe-swiftshader", "--enable-precise-memory-info"),
+)
 GOALS = {"a word's heat": 0.15, "a dragged threshold": 0.1, "a word taught by a click": 1.0}
 """Most seconds at 10,000 Gaussians, until colors are given to the drawing, which takes as long as a machine's
 graphics do."""
@@ -84,3 +96,37 @@ class PageBenchmark:
             page.evaluate(_TIMES, [WORDS, 2])  # compiles
             times: dict[str, list[float]] = page.evaluate(_TIMES, [WORDS, self.repeats])
         return times
+
+
+@contextmanager
+def chromium() -> Iterator[Any]:
+    """Start Chromium; yields playwright's browser. Raises UserError without either of them."""
+    try:
+        from playwright.sync_api import sync_playwright
+    except ModuleNotFoundError as error:
+        raise UserError("playwright drives the browser: pip install -e '.[test]'") from error
+    program = next(filter(None, map(shutil.which, _NAMES)), None)
+    if program is None:
+        raise UserError("there is no Chromium on this machine: apt install chromium")
+    with sync_playwright() as play:
+        browser = play.chromium.launch(executable_path=program, args=_SWITCHES)
+        try:
+            yield browser
+        finally:
+            browser.close()
+
+
+class _Quiet(SimpleHTTPRequestHandler):
+    def log_message(self, *_: object) -> None:
+        """Log nothing."""
+
+
+@contextmanager
+def served(folder: Path) -> Iterator[str]:
+    """Serve a folder; yields its address."""
+    server = ThreadingHTTPServer(("127.0.0.1", 0), partial(_Quiet, directory=str(folder)))
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    try:
+        yield f"http://127.0.0.1:{server.server_port}/"
+    finally:
+        server.shutdown()

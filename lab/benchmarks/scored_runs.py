@@ -5,27 +5,32 @@ from __future__ import annotations
 import json
 import math
 import os
+import shlex
 import shutil
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from copy import deepcopy
 from dataclasses import FrozenInstanceError, asdict, dataclass, replace
 from functools import cached_property, partial
 from itertools import islice
+from multiprocessing import get_context
+from multiprocessing.context import BaseContext
 from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING, Any
 
 import torch
 import torch.nn.functional as F
+import tyro
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from lab.benchmarks.ablation_rows import CLIPSEG, FINE_TEACHER, LANGSAM, SAM3, SEGMENTERS, Row
 from lab.landmark.novel_views import read_novel_views
-from lab.reports import in_own_process, reset_host_peak, with_flags
+from lab.reports import reset_host_peak
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import expanded, write_atomically
 from lang3dxl_ns.common.reports import host_peak
@@ -127,7 +132,7 @@ class ScoredRuns:
     def _submit(self, run: Run, log: Path) -> dict[str, float]:
         work = self.folder / f"work-{run.name.replace('/', '-')}"
         try:
-            return in_process_of_its_own(_in_process, run, self.settings, work, log)
+            return in_own_process(_in_process, run, self.settings, work, log)
         finally:
             shutil.rmtree(work, ignore_errors=True)
 
@@ -144,10 +149,21 @@ class ScoredRuns:
         return json.loads(json.dumps(made_with))
 
 
-def in_process_of_its_own(work: Callable[..., dict[str, float]], *args: Any) -> dict[str, float]:
-    """Run `work(*args)`, whose last argument is its log. Raises UserError with the reason if it fails."""
+def in_own_process(work: Callable[..., dict[str, float]], *args: Any) -> dict[str, float]:
+    """Run `work(*args)`, whose last argument is its log, in its own process, so that its peak memory can be
+    measured. Work, arguments and result must be picklable.
+
+    Without a GPU, processes are forked from one that has imported `_LIBRARIES`. With a GPU, they are started
+    anew, since a process that has used a GPU cannot be forked. Raises UserError with the reason if it fails.
+    """
+    if torch.cuda.is_available():
+        context: BaseContext = get_context("spawn")
+    else:
+        context = get_context("forkserver")
+        context.set_forkserver_preload(list(_LIBRARIES))
     try:
-        return in_own_process(work, *args, preload=_LIBRARIES)
+        with ProcessPoolExecutor(1, mp_context=context) as pool:
+            return pool.submit(work, *args).result()
     except BrokenProcessPool as error:
         raise UserError(f"killed, most likely for lack of memory (see {args[-1]})") from error
     except (RuntimeError, MemoryError) as error:
@@ -183,7 +199,8 @@ def run_configuration(run: Run, settings: RunSettings, work: Path) -> Lang3DXLTr
     data = config.pipeline.datamanager
     data.foreground, data.camera_res_scale_factor = settings.foreground, settings.scale
     if settings.flags:
-        config = with_flags(config, settings.flags)
+        options = tyro.conf.FlagConversionOff  # as for `ns-train`, switches take True or False
+        config = tyro.cli(type(config), args=shlex.split(settings.flags), default=config, config=(options,))
         data = config.pipeline.datamanager
     if run.row.own_targets:
         # With a shared cache, rows would overwrite each other's targets. The run makes its own, and is timed.

@@ -7,30 +7,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import torch
 import torch.nn.functional as F
-import tyro
 from jaxtyping import Float, UInt8
 from numpy import ndarray as Array
 from torch import Tensor
 
 from lab.clip_training.captions import CLASS, UNLABELED
-from lab.clip_training.views import (
-    COLOR,
-    ELEMENT,
-    HEIGHT,
-    PART,
-    SPLITS,
-    WIDTH,
-    ViewFolder,
-    background_rendering,
-)
+from lab.clip_training.views import COLOR, ELEMENT, PART
 from lab.landmark.labels import CATEGORIES, SMALLEST_POSITIVE, category_masks
 from lang3dxl_ns.evaluation.scores import average_precision
-from lang3dxl_ns.preparation.encoders import ImageTextEncoder, load_image_text_encoder
+from lang3dxl_ns.preparation.encoders import ImageTextEncoder
 from lang3dxl_ns.preparation.pyramid import build_clip_target
 from lang3dxl_ns.query.relevancy import CANONICAL, Queries
 
@@ -80,20 +69,11 @@ class TeacherScore:
     """Average precision per category over the views that show it, and the mean over the categories."""
 
     precision: dict[str, float]
-    deviation: dict[str, float]
-    """Standard error of each category's average precision."""
-    views: dict[str, int]
-    """Number of views that show each category."""
 
     @classmethod
     def of(cls, found: dict[str, list[float]]) -> TeacherScore:
         """The score from the views' precisions; categories that none of them shows are left out."""
-        found = {name: values for name, values in found.items() if values}
-        return cls(
-            precision={name: float(np.mean(values)) for name, values in found.items()},
-            deviation={name: float(np.std(values) / len(values) ** 0.5) for name, values in found.items()},
-            views={name: len(values) for name, values in found.items()},
-        )
+        return cls({name: float(np.mean(values)) for name, values in found.items() if values})
 
     @property
     def mean(self) -> float:
@@ -134,42 +114,3 @@ def score_photos(
             if precision is not None and mask.mean() >= SMALLEST_POSITIVE:
                 found[word].append(precision)
     return TeacherScore.of(found)
-
-
-@dataclass
-class ScoreTeacher:
-    """Print the zero-shot score of a CLIP on the landmarks of a split, as a markdown table."""
-
-    cache: Path
-    """Folder of rendered views; missing ones are rendered."""
-    clip: str = "builtin"
-    """CLIP: "builtin", a Hugging Face name or a directory."""
-    split: str = "test"
-    """test or validation."""
-    landmarks: int = 200
-    """Number of landmarks, one view each."""
-    sides: tuple[str, ...] = (",".join(map(str, CROP_SIDES)),)
-    """Crop sides in pixels of a 480×360 view, comma-separated; several sets are compared."""
-    threads: int = 1
-    """CPU threads, and rendering processes."""
-
-    def main(self) -> None:
-        torch.set_num_threads(self.threads)
-        folder = self.cache / self.split
-        with background_rendering(folder, SPLITS[self.split][: self.landmarks], 1, self.threads) as tasks:
-            for task in tasks:
-                task.result()
-        seeds = set(SPLITS[self.split][: self.landmarks])
-        views = [landmark.views[0] for landmark in ViewFolder(folder).landmarks if landmark.seed in seeds]
-        encoder = load_image_text_encoder(self.clip, "cpu")
-        print(f"{len(views)} {self.split} landmarks, one wild view each, {WIDTH}×{HEIGHT}\n")
-        print(f"| crop sides | {' | '.join(CATEGORIES)} | mean |\n|{'---|' * (len(CATEGORIES) + 2)}")
-        for sides in self.sides:
-            score = score_teacher(encoder, views, [int(side) for side in sides.split(",")])
-            cells = (f"{score.precision[c]:.3f} ± {score.deviation[c]:.3f}" for c in CATEGORIES)
-            print(f"| {sides} | {' | '.join(cells)} | **{score.mean:.3f}** |", flush=True)
-        print(f"| views | {' | '.join(str(score.views[c]) for c in CATEGORIES)} | |")
-
-
-if __name__ == "__main__":
-    tyro.cli(ScoreTeacher).main()

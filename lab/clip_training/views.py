@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import os
-import signal
-import sys
-import time
 from collections.abc import Iterable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
 from contextlib import contextmanager
@@ -14,7 +11,6 @@ from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
-import tyro
 from jaxtyping import UInt8
 from numpy import ndarray as Array
 
@@ -90,34 +86,3 @@ def background_rendering(
         yield [pool.submit(render_landmark, folder, seed, views) for seed in missing]
     finally:
         pool.shutdown(cancel_futures=True)
-
-
-@dataclass
-class RenderViews:
-    """Render landmarks into a cache folder, ahead of training or scoring. Resumes after an interruption."""
-
-    cache: Path
-    """Cache folder; each split has its own subfolder."""
-    split: str = "train"
-    """train, validation or test."""
-    landmarks: int = 1_500
-    """Number of landmarks."""
-    views: int = 2
-    """Views of each landmark."""
-    processes: int = 1
-    """Rendering processes."""
-
-    def main(self) -> None:
-        signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that the rendering processes end too
-        started = time.monotonic()
-        seeds = SPLITS[self.split][: self.landmarks]
-        with background_rendering(self.cache / self.split, seeds, self.views, self.processes) as tasks:
-            for done, task in enumerate(tasks, 1):
-                task.result()
-                if done % 50 == 0 or done == len(tasks):
-                    rate = (time.monotonic() - started) / done
-                    print(f"{done}/{len(tasks)} landmarks, {rate:.2f} s each", file=sys.stderr, flush=True)
-
-
-if __name__ == "__main__":
-    tyro.cli(RenderViews).main()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,7 +13,7 @@ import torch
 from lab.numerics import optimization
 from lab.numerics.catalog import all_cases
 from lab.numerics.measure import Case, Row, measure
-from lab.reports import as_png, command_line
+from lab.reports import command_line
 from lang3dxl_ns.common.console import tracked
 from lang3dxl_ns.common.device import best_device
 from lang3dxl_ns.common.files import write_atomically
@@ -133,4 +134,6 @@ def _plot(rows: Sequence[Row]) -> bytes:
         panel.grid(alpha=0.25)
     panels[0].set_ylabel(f"relative RMS error (0 drawn at {SMALLEST:.0e})")
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=6, frameon=False)
-    return as_png(figure)
+    file = io.BytesIO()
+    figure.savefig(file, format="png", dpi=150)
+    return file.getvalue()
