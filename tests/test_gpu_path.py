@@ -182,7 +182,7 @@ def test_cudnn_does_not_tune_for_every_size(default):
 def test_code_maps_are_decoded_at_five_sizes(default):
     model = default.pipeline.model
     sizes = set()
-    for model.step in range(200):
+    for model.run.step in range(200):
         sizes.add(decoded_side(model.run))
     assert len(sizes) == 5
     assert (min(sizes), max(sizes)) == model.config.decode_size

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from argparse import ArgumentParser
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
@@ -11,7 +10,6 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import tyro
 
-from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.settings_help import showing, without
 from lang3dxl_ns.preparation.settings import PreparationConfig
 from lang3dxl_ns.scene.capture_settings import CaptureSettings
@@ -58,14 +56,12 @@ class Train(RunSettings, SceneSettings, PreparationConfig, CaptureSettings):
     """Train anew, over the run in the folder."""
 
     def main(self) -> None:
+        from lang3dxl_ns.files.runs import say_what_to_do
         from lang3dxl_ns.training.fit import run_folder
 
         settings = self.settings()
         folder, _ = run_folder(self.data, self.out, settings, self.restart)
-        run = shlex.quote(str(folder))
-        say(f"Walk through it: lang3dxl view {run}")
-        if settings.targets.clip != "none":
-            say(f"Ask it:          lang3dxl query {run} --text windows --out found")
+        say_what_to_do(folder, settings.targets.clip != "none")
 
     @classmethod
     def usual(cls, words: Sequence[str], **changes: Any) -> Train:

@@ -1,12 +1,13 @@
-"""Search for the folders of runs."""
+"""Search for the folders of runs, and what can be done with one."""
 
 from __future__ import annotations
 
+import shlex
 from contextlib import suppress
 from datetime import datetime
 from pathlib import Path
 
-from lang3dxl_ns.common.console import say_once
+from lang3dxl_ns.common.console import say, say_once
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import expanded
 from lang3dxl_ns.scene.record import SCENE_FILE
@@ -40,6 +41,15 @@ def find_config(run: str | Path | None = None) -> Path:
         what = "there is no outputs/ here" if run is None else f"{place} is not a file or folder"
         raise UserError(f"{what}: {_REMEDY}")
     return place
+
+
+def say_what_to_do(run: str | Path, has_words: bool) -> None:
+    """Say the commands that show a finished run and ask it. run: its folder. has_words: whether it was
+    trained with a CLIP."""
+    place = shlex.quote(str(run))
+    say(f"Walk through it: lang3dxl view {place}")
+    if has_words:
+        say(f"Ask it:          lang3dxl query {place} --text windows --out found")
 
 
 def _began(config: Path) -> float:

@@ -23,11 +23,10 @@ from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.settings_help import showing, without
 from lang3dxl_ns.plugin.cameras import to_cameras
 from lang3dxl_ns.plugin.dataparser import (
+    OpenedCaptureConfig,
     PhotoCollectionDataParser,
     PhotoCollectionDataParserConfig,
-    RecordedSceneDataParser,
     parser_for,
-    recorded_scene,
 )
 from lang3dxl_ns.plugin.inert_settings import OF_IMAGE_CACHES
 from lang3dxl_ns.plugin.photo_dataset import PhotoDataset
@@ -35,7 +34,7 @@ from lang3dxl_ns.preparation.needs import needs_table
 from lang3dxl_ns.preparation.settings import PreparationConfig
 from lang3dxl_ns.preparation.targets import FACTS, Batch, SceneFacts
 from lang3dxl_ns.scene.camera import LONGEST_SIDE
-from lang3dxl_ns.scene.capture import open_capture
+from lang3dxl_ns.scene.capture import recorded_capture
 from lang3dxl_ns.scene.companions import cache_folder
 from lang3dxl_ns.scene.record import SCENE_FILE, SceneRecord
 from lang3dxl_ns.training.batches import TrainingData
@@ -84,26 +83,19 @@ class Lang3DXLDataManager(FullImageDatamanager):
     """The photos and targets."""
     train_dataset: PhotoDataset
     eval_dataset: PhotoDataset
-    dataparser: PhotoCollectionDataParser | RecordedSceneDataParser
+    dataparser: PhotoCollectionDataParser
 
     def __init__(self, config: Lang3DXLDataManagerConfig, *args, **kwargs):
         config.check()
         if config.data is not None:
             config.dataparser.data = Path(config.data)
-        opens = kwargs.get("test_mode", "val") != "val"
-        recorded = recorded_scene(config.run) if opens else None
-        try:
+        run = config.run if kwargs.get("test_mode", "val") != "val" else None
+        if run is not None and (run / SCENE_FILE).is_file():
+            config.dataparser = opened_again(config, SceneRecord.read(run / SCENE_FILE))
+        else:
             # Never find a run's own cameras anew: its Gaussians would not match them.
             config.dataparser = parser_for(config.dataparser, config.cache_dir, config.run is None)
-            config.data = config.dataparser.data
-            if recorded is not None:
-                _check_recorded(config.dataparser, recorded.run)
-        except (UserError, FileNotFoundError) as reason:
-            if recorded is None:
-                raise
-            say(f"The run's own cameras are used: {reason}")
-            config.dataparser, config.camera_res_scale_factor = recorded, 1.0
-            config.longer_side = LONGEST_SIDE  # the recorded cameras have the size of training
+        config.data = config.dataparser.data
         super().__init__(config, *args, **kwargs)
 
     def get_datapath(self) -> Path:
@@ -136,12 +128,14 @@ class Lang3DXLDataManager(FullImageDatamanager):
     def setup_train(self) -> None:
         """Prepare missing targets before training; give the model their statistics and the scene's needs."""
         if self.test_mode == "val":
+            photos, trained = len(self.data.capture.photos), len(self.data.capture.split.train)
+            if trained < photos:
+                say(
+                    f"{photos - trained} of {photos} photos are held out of training, for evaluation "
+                    "(`lang3dxl-colmap --eval-mode all` after all other options trains on all)"
+                )
             say(needs_table(self.data.needs))
             self.train_dataset.metadata[FACTS] = self.data.facts()
-
-    def sample_train_cameras(self) -> list[int]:
-        """Return all training photos; `data` has their order."""
-        return list(range(len(self.train_dataset)))
 
     def next_train(self, step: int) -> tuple[Cameras, Batch]:  # type: ignore[override]
         """Return camera and batch of the next training photo; every photo appears once per round. A photo
@@ -173,11 +167,17 @@ class Lang3DXLDataManager(FullImageDatamanager):
         return int((self.train_dataset.cameras.width * self.train_dataset.cameras.height).float().mean())
 
 
-def _check_recorded(config: PhotoCollectionDataParserConfig, run: Path) -> None:
-    """Raise UserError if the photos are no longer those that the run was trained on: nerfstudio would find
-    another frame for the cameras, or hold other photos out."""
-    capture = open_capture(config.data, config, may_reconstruct=False)
-    scene, frame = SceneRecord.read(run / SCENE_FILE), capture.recorded_frame
-    trained = {photo.name for photo in scene.photos if photo.split == "train"}
-    if not scene.has_frame(frame.transform, frame.scale) or set(capture.split.train) != trained:
-        raise UserError(f"photos or cameras in {capture.folder} are not those of the run's training")
+def opened_again(config: Lang3DXLDataManagerConfig, record: SceneRecord) -> OpenedCaptureConfig:
+    """Open a run's photos; if they are gone, or no longer those that it was trained on (nerfstudio would find
+    another frame for the cameras, or hold other photos out), its recorded cameras, which is said."""
+    try:
+        source = parser_for(config.dataparser, config.cache_dir, may_reconstruct=False)
+        capture = source.open()
+        if not record.has_frame(capture.recorded_frame) or set(record.trained) != set(capture.split.train):
+            raise UserError(f"photos or cameras in {capture.folder} are not those of the run's training")
+        return OpenedCaptureConfig(data=source.data, capture=capture, scene_scale=source.scene_scale)
+    except (UserError, FileNotFoundError) as reason:
+        say(f"The run's own cameras are used: {reason}")
+        config.camera_res_scale_factor = 1.0
+        config.longer_side = LONGEST_SIDE  # the recorded cameras have the size of training
+        return OpenedCaptureConfig(data=config.dataparser.data, capture=recorded_capture(record))

@@ -36,18 +36,15 @@ _GROUPS_OF_RENDERINGS = ("codes", "field_encoding", "field_decoder", "downsample
 """Optimizer groups of such semantics."""
 
 
-def check_inert(
-    model: TrainingSettings, data: PreparationConfig, optimizers: Mapping[str, Any] | None = None
-) -> None:
+def check_inert(model: TrainingSettings, data: PreparationConfig, optimizers: Mapping[str, Any]) -> None:
     """Raise UserError if a setting that has no effect in this run differs from its default. model, data:
     settings of the model and of the data manager. optimizers: those of the parameter groups."""
     if model.decoder.learns_from_renderings:
         return
     of_scene, of_targets = without_effect(model, data)
     changed = [f"pipeline.model.{name}" for name in of_scene]
-    default = parameter_groups(learning_rates())
-    given = default if optimizers is None else optimizers
-    changed += [f"optimizers.{name}" for name in _GROUPS_OF_RENDERINGS if given[name] != default[name]]
+    usual = parameter_groups(learning_rates())
+    changed += [f"optimizers.{name}" for name in _GROUPS_OF_RENDERINGS if optimizers[name] != usual[name]]
     changed += [f"pipeline.datamanager.{name}" for name in of_targets]
     if changed:
         raise UserError(

@@ -42,7 +42,7 @@ def load_run(
     # The checkpoint brings its own Gaussians, so start with as few as possible.
     start = replace(settings, sky_gaussians=0, random_init=False)  # type: ignore[call-arg]
     start.fit_to_run(start.total_steps)
-    facts = SceneFacts([photo.name for photo in file.photos if photo.split == "train"])
+    facts = SceneFacts(file.trained)
     model = Training.begin(start, facts, (torch.eye(4)[:, :3], torch.zeros(4, 3)))
     with readable(f"the checkpoint {path} does not fit the config.yml beside it", "copy both from one run"):
         model.load(model_state(checkpoint["pipeline"]))

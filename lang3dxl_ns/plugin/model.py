@@ -12,11 +12,11 @@ from jaxtyping import Float, UInt8
 from nerfstudio.cameras.camera_optimizers import CameraOptimizer, CameraOptimizerConfig
 from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.data.scene_box import OrientedBox
+from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.utils.colors import get_color
 from numpy import ndarray as Array
 from torch import Tensor
 from torch.nn import Parameter
-from torch.optim import Optimizer
 
 from lang3dxl_ns.common.console import say_once
 from lang3dxl_ns.common.errors import UserError
@@ -85,6 +85,8 @@ class Lang3DXLModel(SplatfactoModel):
     semantic_field: Decoder | None
     appearance: AppearanceField | None
     answers: RenderedAnswers | Conversation | None = None
+    step = 0
+    """Splatfacto's counter, which only scales its photos, by 1 here; the iteration is `run.step`."""
     refuses_lenses = False
     """Whether a camera that is not perspective is an error, as for `ns-render`; viewers are told of it."""
 
@@ -111,23 +113,9 @@ class Lang3DXLModel(SplatfactoModel):
             self.register_buffer("clip_mean", semantics.clip_mean)
             self.register_buffer("dense_mean", semantics.dense_mean)
 
-    @property
-    def step(self) -> int:
-        """The present iteration."""
-        return self.run.step
-
-    @step.setter
-    def step(self, step: int) -> None:
-        self.run.step = step
-
-    @property  # type: ignore[override]
-    def optimizers(self) -> Mapping[str, Optimizer]:
-        """The optimizers, which nerfstudio sets before every iteration."""
-        return self.run.optimizers
-
-    @optimizers.setter
-    def optimizers(self, optimizers: Mapping[str, Optimizer]) -> None:
-        self.run.optimizers = optimizers
+    def step_cb(self, optimizers: Optimizers, step: int) -> None:
+        """Tell the run the iteration that begins, and its optimizers."""
+        self.run.step, self.run.optimizers = step, optimizers.optimizers
 
     # ── looking ─────────────────────────────────────────────────────────────────────────────────────
 
@@ -238,7 +226,7 @@ class Lang3DXLModel(SplatfactoModel):
         """Load a checkpoint of any number of Gaussians, with or without semantics."""
         self.run.match(state)
         self.adopt_parts()
-        self.step = self.config.total_steps
+        self.run.step = self.config.total_steps
         return super(SplatfactoModel, self).load_state_dict(state, **kwargs)
 
 

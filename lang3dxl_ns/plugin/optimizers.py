@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
+from typing import Any
 
 from nerfstudio.engine.optimizers import AdamOptimizerConfig, Optimizers
 from nerfstudio.engine.schedulers import Scheduler, SchedulerConfig
@@ -12,7 +13,10 @@ from torch.cuda.amp.grad_scaler import GradScaler
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 
+from lang3dxl_ns.common.checks import check_numbers
 from lang3dxl_ns.training.learning_rates import Rate, Rates, Schedule
+
+_OF_SCHEDULES = {**dict.fromkeys(("start", "end", "until"), (1e-9, 1e9)), "warm": (0, 1), "power": (0, 100)}
 
 
 @dataclass
@@ -48,6 +52,15 @@ def parameter_groups(rates: Rates) -> dict[str, dict]:
         }
         for name, (rate, decay) in rates.items()
     }
+
+
+def check_rates(groups: Mapping[str, Mapping[str, Any]]) -> None:
+    """Raise UserError for a rate or schedule of the parameter groups that is out of its range."""
+    for name, group in groups.items():
+        option = f"--optimizers.{name.replace('_', '-')}."
+        check_numbers(group["optimizer"], {"lr": (1e-12, 1e3)}, f"{option}optimizer.")
+        if isinstance(group["scheduler"], RunScheduleConfig):
+            check_numbers(group["scheduler"], _OF_SCHEDULES, f"{option}scheduler.")
 
 
 class GuardedOptimizers(Optimizers):

@@ -259,6 +259,5 @@ def stand_of(
 
 def _changes(trainer: Trainer | None) -> bool:
     """Return whether training still changes its model; None: there is no training."""
-    if trainer is None or trainer.training_state == "completed":
-        return False
-    return not getattr(trainer, "has_final_words", False)
+    over = trainer is None or trainer.training_state == "completed"
+    return not (over or getattr(trainer, "has_final_words", False))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
@@ -21,7 +21,6 @@ from lang3dxl_ns.common.console import accept_any_console, say
 from lang3dxl_ns.common.errors import UserError, readable
 from lang3dxl_ns.evaluation.score_run import Evaluation, EvaluationSettings
 from lang3dxl_ns.plugin.datamanager import Lang3DXLDataManager, Lang3DXLDataManagerConfig
-from lang3dxl_ns.plugin.dataparser import RecordedSceneDataParserConfig
 from lang3dxl_ns.plugin.load_scene import model_state
 from lang3dxl_ns.plugin.model import Lang3DXLModel, Lang3DXLModelConfig, RenderedAnswers
 from lang3dxl_ns.plugin.panel import AskPanel
@@ -64,7 +63,7 @@ class Lang3DXLPipeline(VanillaPipeline):
     @cached_property
     def evaluation(self) -> Evaluation:
         """Evaluation of the present model. Raises UserError for a run whose photos are gone."""
-        if isinstance(self.datamanager.config.dataparser, RecordedSceneDataParserConfig):
+        if self.datamanager.data.capture.source is None:
             raise UserError(
                 "this run can't be evaluated without the photos that it was trained on (see above): restore "
                 "them, or correct data in its config.yml. `lang3dxl evaluate run NAME.scene --ground-truth "
@@ -128,23 +127,22 @@ class Lang3DXLPipeline(VanillaPipeline):
             self.model.load_state_dict(model_state(state_dict), strict=True)
 
 
-_previous_hook = sys.excepthook
-
-
 def print_user_errors_plainly() -> None:
     """Make commands end on a `UserError` with its message alone, without a traceback, on any console."""
-    global _previous_hook
     accept_any_console()
-    if sys.excepthook is not _print_user_error:
-        _previous_hook, sys.excepthook = sys.excepthook, _print_user_error
+    if not isinstance(sys.excepthook, _PlainErrors):
+        sys.excepthook = _PlainErrors(sys.excepthook)
 
 
-def _print_user_error(
-    kind: type[BaseException], error: BaseException, traceback: TracebackType | None
-) -> None:
-    message = disk_trouble(error) if isinstance(error, OSError) else None
-    message = str(error) if isinstance(error, UserError) else message
-    if message is not None:
+@dataclass(frozen=True)
+class _PlainErrors:
+    """Hook for uncaught exceptions, which prints users' errors itself and leaves the others to `others`."""
+
+    others: Callable[[type[BaseException], BaseException, TracebackType | None], Any]
+
+    def __call__(self, kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
+        message = disk_trouble(error) if isinstance(error, OSError) else None
+        message = str(error) if isinstance(error, UserError) else message
+        if message is None:
+            return self.others(kind, error, trace)
         CONSOLE.print(f"[bold red]Error:[/bold red] {escape(message)}", soft_wrap=True)
-    else:
-        _previous_hook(kind, error, traceback)

@@ -23,7 +23,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from rich.markup import escape
 from torch.cuda.amp.grad_scaler import GradScaler
 
-from lang3dxl_ns.common.console import say, some
+from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.device import multiplies_bfloat16
 from lang3dxl_ns.common.errors import UserError, readable
 from lang3dxl_ns.common.files import expanded
@@ -31,6 +31,7 @@ from lang3dxl_ns.common.memory import ran_out_of_memory
 from lang3dxl_ns.common.options import data_option
 from lang3dxl_ns.common.stages import Stages
 from lang3dxl_ns.common.stopping import stoppable
+from lang3dxl_ns.files.runs import say_what_to_do
 from lang3dxl_ns.files.scene_file import SUFFIX, Provenance, replace_scene
 from lang3dxl_ns.plugin.optimizers import GuardedOptimizers
 from lang3dxl_ns.plugin.pipeline import Lang3DXLPipeline, Lang3DXLPipelineConfig
@@ -38,7 +39,7 @@ from lang3dxl_ns.plugin.run_checkpoint import check_checkpoint, read_checkpoint
 from lang3dxl_ns.preparation.needs import NEEDS_FILE, write_needs
 from lang3dxl_ns.preparation.store import PhotosGoneError
 from lang3dxl_ns.scene.record import SCENE_FILE, SceneRecord
-from lang3dxl_ns.training.checkpoint import NOT_A_CHECKPOINT, save_checkpoint
+from lang3dxl_ns.training.checkpoint import NOT_A_CHECKPOINT, check_same_photos, save_checkpoint
 from lang3dxl_ns.training.estimate import estimate
 from lang3dxl_ns.training.learn_codes import forget_words
 from lang3dxl_ns.training.learning_rates import add_rows_to_state
@@ -188,7 +189,8 @@ class Lang3DXLTrainer(Trainer):
         state = read_checkpoint(path)
         if (before := path.parent.with_name(SCENE_FILE)).is_file():
             corrected = any(name.endswith("pose_adjustment") for name in state["pipeline"])
-            self._check_photos(path, SceneRecord.read(before), corrected)
+            data = self.pipeline.datamanager.data
+            check_same_photos(path, SceneRecord.read(before), data.record(), corrected)
         remedy = "give --load-dir a run's folder nerfstudio_models, or --load-checkpoint one of its files"
         with readable(f"{path} is not a checkpoint of lang3dxl", remedy, NOT_A_CHECKPOINT):
             self._start_step = state["step"] + 1
@@ -205,26 +207,6 @@ class Lang3DXLTrainer(Trainer):
                 self.grad_scaler.load_state_dict(state["scalers"])
             self._run_state, self.words_are_learned = state["run"], state["words"]
         CONSOLE.log(f"Loaded {path}")
-
-    def _check_photos(self, path: Path, before: SceneRecord, corrected: bool) -> None:
-        """Check that a checkpoint's photos are this run's. Raises UserError for another frame, and, if the
-        cameras were `corrected` one by one, for other training photos."""
-        data = self.pipeline.datamanager.data
-        frame = data.capture.recorded_frame
-        if not before.has_frame(frame.transform, frame.scale):
-            raise UserError(f"{path} belongs to other photos or another reconstruction of them: train anew")
-        splits = [{p.name: p.split for p in file.photos} for file in (before, data.record())]
-        trained = [[name for name, split in known.items() if split == "train"] for known in splits]
-        if corrected and trained[0] != trained[1]:
-            raise UserError(
-                f"{path} has corrections of other training photos' cameras: restore those, or train anew"
-            )
-        moved = [name for name, split in splits[1].items() if splits[0].get(name, split) != split]
-        if moved:
-            say(
-                f"{len(moved)} photos moved between the training and held-out sets since this run began "
-                f"({some(moved)}): metrics of held-out photos will be too good"
-            )
 
     def eval_iteration(self, step: int) -> None:
         """Evaluate in between as nerfstudio does. Photos that can't be read don't end the training."""
@@ -252,11 +234,14 @@ class Lang3DXLTrainer(Trainer):
         return sound
 
     @property
+    def _needs_words(self) -> bool:
+        return self.pipeline.model.run.learns_words_at_the_end and not self.words_are_learned
+
+    @property
     def is_finished(self) -> bool:
         """Whether the loaded checkpoint has all iterations, and the words if they are learned after them."""
-        words = self.words_are_learned or not self.pipeline.model.run.learns_words_at_the_end
         beyond = self._start_step - self.config.max_num_iterations
-        return beyond > 0 or (beyond == 0 and words)
+        return beyond > 0 or (beyond == 0 and not self._needs_words)
 
     @property
     def has_final_words(self) -> bool:
@@ -386,11 +371,8 @@ class Lang3DXLTrainer(Trainer):
         earlier = sorted(checkpoints.parent.glob(f"[!.]*{SUFFIX}")) if checkpoints else []  # may be renamed
         told = Provenance(title=path.stem, made_how=how)
         _, size = replace_scene(path, scene, told, *earlier)
-        run = shlex.quote(os.path.relpath(self.base_dir))
         say(f"The scene:       {os.path.relpath(path)} ({size / 1e6:.1f} MB)")
-        say(f"Walk through it: lang3dxl view {run}")
-        if model.semantic_field is not None:
-            say(f"Ask it:          lang3dxl query {run} --text windows --out found")
+        say_what_to_do(os.path.relpath(self.base_dir), model.semantic_field is not None)
 
     def _learn_words(self) -> None:
         # Hold the lock, since the viewer may be learning words for a recent question.
@@ -427,8 +409,6 @@ class Lang3DXLTrainer(Trainer):
         if self.config.save_only_latest_checkpoint:
             for other in set(self.checkpoint_dir.glob("*.ckpt")) - {path}:
                 other.unlink()
-        done = step + 1 >= self.config.pipeline.model.total_steps and (
-            self.words_are_learned or not self.pipeline.model.run.learns_words_at_the_end
-        )
-        if self._is_ending and done:
+        done = step + 1 >= self.config.pipeline.model.total_steps
+        if self._is_ending and done and not self._needs_words:
             self.write_scene()

@@ -10,7 +10,7 @@ from typing import Any
 from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 
-from lang3dxl_ns.common.checks import check_address, check_numbers
+from lang3dxl_ns.common.checks import check_numbers
 from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.device import best_device, warn_of_unused_gpu
 from lang3dxl_ns.common.errors import UserError
@@ -19,21 +19,18 @@ from lang3dxl_ns.common.settings_help import showing
 from lang3dxl_ns.files.runs import find_config
 from lang3dxl_ns.plugin.dataparser import PhotoCollectionDataParserConfig
 from lang3dxl_ns.plugin.inert_settings import check_inert
-from lang3dxl_ns.plugin.optimizers import RunAdamConfig, RunScheduleConfig
+from lang3dxl_ns.plugin.optimizers import RunAdamConfig, RunScheduleConfig, check_rates
 from lang3dxl_ns.plugin.pipeline import Lang3DXLPipeline, print_user_errors_plainly
 from lang3dxl_ns.plugin.run_checkpoint import check_checkpoint, latest_checkpoint
 from lang3dxl_ns.plugin.run_settings import load_configs, no_config, read_settings
 from lang3dxl_ns.plugin.trainer import Lang3DXLTrainer, RunConfig, requested_checkpoint
-from lang3dxl_ns.plugin.viewer_guard import ONLY_HERE
+from lang3dxl_ns.plugin.viewer_guard import check_viewer
 from lang3dxl_ns.preparation.model_files import BUILTIN, check_encoders
 from lang3dxl_ns.preparation.needs import read_needs
 from lang3dxl_ns.scene.photo_folder import check_data
 from lang3dxl_ns.scene.record import SCENE_FILE
 from lang3dxl_ns.training.batches import settle
 from lang3dxl_ns.training.estimate import check_device
-from lang3dxl_ns.web.access import is_local
-
-_OF_SCHEDULES = {**dict.fromkeys(("start", "end", "until"), (1e-9, 1e9)), "warm": (0, 1), "power": (0, 100)}
 
 
 @showing(
@@ -67,37 +64,41 @@ class Lang3DXLTrainerConfig(RunConfig):
         say(f"Settings: {self.get_base_dir() / 'config.yml'}")
 
     def set_timestamp(self) -> None:
-        """Resolve what depends on the run, and check that the encoders are available before a folder is made
-        for it. nerfstudio calls this once, before the configuration is printed and saved."""
+        """Check the settings, resolve what depends on the run, and make the folder of a new one. nerfstudio
+        calls this once, before the configuration is printed and saved."""
         print_user_errors_plainly()
-        check_numbers(self, {"max_num_iterations": (1, 1e9), "max_skipped_steps": (0, 1e9)})
-        self.pipeline.model.check()
-        check_numbers(self.machine, {"seed": (0, 2**32 - 1)}, "--machine.")
-        for name, group in self.optimizers.items():
-            option = f"--optimizers.{name.replace('_', '-')}.optimizer."
-            check_numbers(group["optimizer"], {"lr": (1e-12, 1e3)}, option)
-            if isinstance(group["scheduler"], RunScheduleConfig):
-                check_numbers(group["scheduler"], _OF_SCHEDULES, option.replace("optimizer.", "scheduler."))
-        self.pipeline.datamanager.check()
-        check_data(self.pipeline.datamanager.data or self.data)
-        if self.is_viewer_enabled():
-            if self.viewer.make_share_url or not is_local(self.viewer.websocket_host):
-                raise UserError(f"--viewer.websocket-host, --viewer.make-share-url: {ONLY_HERE}")
-            check_address(self.viewer.websocket_host, self.viewer.websocket_port)
-        if self.pipeline.datamanager.run is None:  # a run's config.yml contains resolved values
-            check_inert(self.pipeline.model, self.pipeline.datamanager, self.optimizers)
+        self.check()
         resumed, fresh = requested_checkpoint(self), self.timestamp == "{timestamp}"
         super().set_timestamp()
         self.fit_to_run()
         own = super().get_checkpoint_dir().absolute()
-        continues = resumed is not None and resumed.absolute().parent == own
-        if not (fresh or continues) and any(own.glob("*.ckpt")):
+        goes_on = resumed is not None and resumed.absolute().parent == own
+        if not (fresh or goes_on) and any(own.glob("*.ckpt")):
             raise UserError(f"{own} holds an earlier run: resume it with --load-dir, or change --timestamp")
-        data = self.pipeline.datamanager
-        check_encoders(data.clip, data.dense)
+        check_encoders(self.pipeline.datamanager.clip, self.pipeline.datamanager.dense)
         check_device(self.machine.device_type, self.pipeline.model.rasterizer)
         if fresh:
             self._claim_folder()
+
+    def check(self) -> None:
+        """Raise UserError for a setting that is out of its range, impossible or without effect."""
+        model, data = self.pipeline.model, self.pipeline.datamanager
+        check_numbers(self, {"max_num_iterations": (1, 1e9), "max_skipped_steps": (0, 1e9)})
+        check_numbers(self.machine, {"seed": (0, 2**32 - 1)}, "--machine.")
+        if self.machine.num_devices * self.machine.num_machines > 1:
+            raise UserError(
+                "training runs on one device: densification changes the number of parameters, which "
+                "torch's DistributedDataParallel does not support. Leave --machine.num-devices at 1; several "
+                "GPUs can prepare targets (lang3dxl prepare --workers N), or train scenes side by side"
+            )
+        check_rates(self.optimizers)
+        model.check()
+        data.check()
+        check_data(data.data or self.data)
+        if self.is_viewer_enabled():
+            check_viewer(self.viewer)
+        if data.run is None:  # a run's config.yml contains resolved values
+            check_inert(model, data, self.optimizers)
 
     def _claim_folder(self) -> None:
         """Create a unique folder, even if two runs start in the same second."""
@@ -121,13 +122,6 @@ class Lang3DXLTrainerConfig(RunConfig):
     def fit_to_run(self) -> None:
         """Resolve rates, schedules and presets for this number of iterations. Paths become absolute, so that
         config.yml is complete and can be read from any folder."""
-        if self.machine.num_devices * self.machine.num_machines > 1:
-            print_user_errors_plainly()
-            raise UserError(
-                "training runs on one device: densification changes the number of parameters, which "
-                "torch's DistributedDataParallel does not support. Leave --machine.num-devices at 1; several "
-                "GPUs can prepare targets (lang3dxl prepare --workers N), or train scenes side by side"
-            )
         iterations = self.max_num_iterations
         for group in self.optimizers.values():
             if isinstance(group["optimizer"], RunAdamConfig):
@@ -162,25 +156,24 @@ class Lang3DXLTrainerConfig(RunConfig):
         if not (run / "config.yml").is_file():
             return
         earlier: Any = read_config(run / "config.yml").pipeline
-        if self.pipeline.datamanager.clip == "auto":
-            self.pipeline.datamanager.clip = earlier.datamanager.clip
-        earlier = earlier.model
-        needs, mine = read_needs(run), self.pipeline.model
+        data, needs = self.pipeline.datamanager, read_needs(run)
+        mine, before = self.pipeline.model, earlier.model
+        if data.clip == "auto":
+            data.clip = earlier.datamanager.clip
         if mine.semantic_field.preset == "auto":
-            mine.semantic_field = replace(mine.semantic_field, preset=earlier.semantic_field.preset)
+            mine.semantic_field = replace(mine.semantic_field, preset=before.semantic_field.preset)
         if mine.appearance.preset == "auto":
-            mine.appearance.preset = earlier.appearance.preset
-
-        def settle(owner: Any, before: Any, name: str, component: str) -> None:
-            choice = getattr(before, name)
+            mine.appearance.preset = before.appearance.preset
+        for owner, then, name, component in (
+            (mine.appearance, before.appearance, "use", "appearance"),
+            (mine, before, "view_dependence", "view dependence"),
+            (mine, before, "camera_optimization", "camera optimizer"),
+        ):
+            choice = getattr(then, name)
             if choice == "auto" and component in needs:
                 choice = "on" if needs[component] else "off"
             if getattr(owner, name) == "auto":
                 setattr(owner, name, choice)
-
-        settle(mine.appearance, earlier.appearance, "use", "appearance")
-        settle(mine, earlier, "view_dependence", "view dependence")
-        settle(mine, earlier, "camera_optimization", "camera optimizer")
 
 
 def read_config(path: Path) -> TrainerConfig:

@@ -14,9 +14,12 @@ from typing import Any
 
 import viser.infra._infra as infra
 import websockets.server
+from nerfstudio.configs.base_config import ViewerConfig
 from viser import _messages
 
+from lang3dxl_ns.common.checks import check_address
 from lang3dxl_ns.common.console import say
+from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.web.access import Access, is_local
 
 HOST = "127.0.0.1"
@@ -26,6 +29,13 @@ ONLY_HERE = (
 )
 _FILE = re.compile(r"/(\w[\w.-]*(/\w[\w.-]*)*)?(\?.*)?")
 """Addresses of files below the page's folder: no part of one begins with a dot."""
+
+
+def check_viewer(viewer: ViewerConfig) -> None:
+    """Raise UserError for settings that would open the viewer to others, or an address that is in use."""
+    if viewer.make_share_url or not is_local(viewer.websocket_host):
+        raise UserError(f"--viewer.websocket-host, --viewer.make-share-url: {ONLY_HERE}")
+    check_address(viewer.websocket_host, viewer.websocket_port)
 
 
 def guard_viewers() -> None:

@@ -16,11 +16,12 @@ import numpy as np
 import torch
 from jaxtyping import Float32, Float64, UInt8
 from numpy import ndarray as Array
+from torch import Tensor
 
 from lang3dxl_ns.common.console import say, some
 from lang3dxl_ns.common.errors import UserError, printable, readable
 from lang3dxl_ns.common.files import expanded, read_names
-from lang3dxl_ns.scene.camera import camera_to_world
+from lang3dxl_ns.scene.camera import camera_to_world, view_matrix
 from lang3dxl_ns.scene.capture_settings import CaptureSettings
 from lang3dxl_ns.scene.colmap import Reconstruction, TrackedPhoto, photos_in_model, read_reconstruction
 from lang3dxl_ns.scene.companions import inside, is_inside
@@ -39,6 +40,7 @@ from lang3dxl_ns.scene.names import listed, resolve
 from lang3dxl_ns.scene.photo import Photo, upright_in_model
 from lang3dxl_ns.scene.photo_folder import check_data, find_photos, photos_below
 from lang3dxl_ns.scene.reconstruct import reconstruct_scene
+from lang3dxl_ns.scene.record import SceneRecord
 from lang3dxl_ns.scene.transforms import SPLITS, TRANSFORMS, Transforms, read_transforms
 from lang3dxl_ns.scene.video import extract_frames, frames_folder, is_video
 
@@ -158,10 +160,13 @@ class Capture:
         return self.frame.poses(self._world_from_camera(names)).astype(np.float32)
 
     @property
-    def seeds(self) -> tuple[Float32[Array, "m 3"], UInt8[Array, "m 3"]]:
-        """Points in training's frame, and their colors."""
+    def seeds(self) -> tuple[Float32[Tensor, "m 3"], UInt8[Tensor, "m 3"]] | None:
+        """Points that training starts from, in its frame, and their colors. A transforms.json may have none;
+        training then starts from random ones."""
         points = self.frame.points(self.reconstruction.points)
-        return points.astype(np.float32), self.reconstruction.colors
+        if self.transforms is not None and not len(points):
+            return None
+        return torch.from_numpy(points.astype(np.float32)), torch.from_numpy(self.reconstruction.colors)
 
     def _world_from_camera(self, names: Sequence[str]) -> Float64[Array, "n 3 4"]:
         views = np.array([self.reconstruction.photos[name].camera_from_world for name in names], np.float64)
@@ -323,6 +328,24 @@ def _of_transforms(path: Path, settings: CaptureSettings) -> Capture:
     capture = _usable(path.parent, path.parent, found, files, {}, settings, True, content.masks)
     left_out = {name: str(reason) for name, reason in content.left_out.items()} | capture.left_out
     return replace(capture, left_out=left_out, source=path, transforms=content)
+
+
+# ── from a run's record ─────────────────────────────────────────────────────────────────────────────────
+
+
+def recorded_capture(record: SceneRecord) -> Capture:
+    """Return a run's photos and cameras, at training resolution, as its record has them, without a `source`.
+    Its points are as few as can be begun with, since the run's checkpoint brings its Gaussians."""
+    poses = record.frame.inverse().poses(np.array([photo.camera_to_world for photo in record.photos]))
+    tracked, nothing = {}, np.zeros((0, 3))
+    for photo, pose in zip(record.photos, torch.from_numpy(poses), strict=True):
+        view = view_matrix(pose)[:3].numpy()
+        tracked[photo.name] = TrackedPhoto(photo.name, photo.lens, view, nothing, nothing[:, :2])
+    model = Reconstruction(tracked, np.eye(4)[:, :3], np.zeros((4, 3), np.uint8))
+    held_out = tuple(photo.name for photo in record.photos if photo.split == "eval")
+    split = Split(tuple(record.trained), held_out or tuple(record.trained))  # no photo may be held out
+    photos = [photo.photo(Path(record.data)) for photo in record.photos]
+    return Capture(Path(record.data), photos, model, known_split=split, known_frame=record.frame)
 
 
 # ── cameras that are lost ───────────────────────────────────────────────────────────────────────────────

@@ -28,6 +28,7 @@ from lang3dxl_ns.common.files import read_json, replace_file
 from lang3dxl_ns.common.image import resize_nearest
 from lang3dxl_ns.scene.camera import Camera, Lens, check_pose, view_matrix
 from lang3dxl_ns.scene.companions import is_name
+from lang3dxl_ns.scene.frame import Frame
 from lang3dxl_ns.scene.georeference import Georeference, georeference, georeference_from_json, gps_position
 from lang3dxl_ns.scene.photo import Photo
 
@@ -165,12 +166,21 @@ class SceneRecord:
             expect(content.pop("version") == _VERSION, "another version wrote it")
             return scene_from_json(content)
 
-    def has_frame(self, transform: Any, scale: float) -> bool:
-        """Return whether the frame is the one of a transform [3, 4] and scale, to a hundredth of a unit
-        of the model."""
-        apart = np.abs(np.array(self.transform) - np.array(transform))
+    @property
+    def trained(self) -> list[str]:
+        """Names of the training photos."""
+        return [photo.name for photo in self.photos if photo.split == "train"]
+
+    @property
+    def frame(self) -> Frame:
+        """Similarity to the model's frame from COLMAP's."""
+        return Frame(np.array(self.transform, np.float64), self.scale)
+
+    def has_frame(self, frame: Frame) -> bool:
+        """Return whether the model is in this frame, to a hundredth of a unit of the model."""
+        apart = np.abs(np.array(self.transform) - frame.transform)
         near = apart[:, :3].max() < 1e-3 and self.scale * apart[:, 3].max() < 1e-2
-        return bool(near) and math.isclose(self.scale, scale, rel_tol=1e-3)
+        return bool(near) and math.isclose(self.scale, frame.scale, rel_tol=1e-3)
 
     def photo(self, name: str) -> ScenePhoto:
         """Find the photo with this name, or with this file name or stem if only one photo has it. Raises

@@ -1,4 +1,4 @@
-"""Checkpoints of a run of `fit`: written whole or not at all, and read without executing code."""
+"""Checkpoints: written whole or not at all, read without executing code, and compared with the run."""
 
 from __future__ import annotations
 
@@ -13,8 +13,10 @@ import torch
 from torch import Tensor
 
 from lang3dxl_ns.common.checks import expect
+from lang3dxl_ns.common.console import say, some
 from lang3dxl_ns.common.errors import DAMAGE, UserError, readable
 from lang3dxl_ns.common.files import check_regular, replace_durably
+from lang3dxl_ns.scene.record import SceneRecord
 
 CHECKPOINT = "training.ckpt"
 """Name of the checkpoint in a run's folder."""
@@ -56,6 +58,34 @@ def load_checked(path: Path, tensors: str) -> dict[str, Any]:
             sound = not name.endswith(".means") or bool(value.isfinite().any())
             expect(sound, "no Gaussian has a position that is a number")
     return state
+
+
+def check_same_photos(path: Path, before: SceneRecord, now: SceneRecord, corrected: bool) -> None:
+    """Check that a checkpoint's photos are those of the run that is to go on, and say which ones moved
+    between the training and held-out sets.
+
+    Args:
+        path: the checkpoint.
+        before: record of the run that it is of.
+        now: record of the run that is to go on.
+        corrected: whether it has corrections of each training photo's camera.
+
+    Raises:
+        UserError: the cameras are in another frame, or the corrections are of other training photos.
+    """
+    if not before.has_frame(now.frame):
+        raise UserError(f"{path} belongs to other photos or another reconstruction of them: train anew")
+    if corrected and before.trained != now.trained:
+        raise UserError(
+            f"{path} has corrections of other training photos' cameras: restore those, or train anew"
+        )
+    splits = {photo.name: photo.split for photo in before.photos}
+    moved = [photo.name for photo in now.photos if splits.get(photo.name, photo.split) != photo.split]
+    if moved:
+        say(
+            f"{len(moved)} photos moved between the training and held-out sets since this run began "
+            f"({some(moved)}): metrics of held-out photos will be too good"
+        )
 
 
 def as_damage(path: Path) -> AbstractContextManager[None]:

@@ -144,13 +144,10 @@ class Run:
         self.data = TrainingData(capture, settings.targets, cache_dir, device, learned, scale)
         self.path = folder / f"{capture.folder.name or 'scene'}{SUFFIX}"
         self.start, self.words_are_learned, self.title = 0, False, self.path.stem
-        points, colors = map(torch.from_numpy, capture.seeds)
         facts = self.data.facts()
         say(needs_table(self.data.needs))
         torch.manual_seed(settings.seed)
-        # Without points in a transforms.json, which is allowed, training starts from random ones.
-        seeds = (points, colors) if capture.transforms is None or len(points) else None
-        self.state = Training.begin(settings.scene, facts, seeds)
+        self.state = Training.begin(settings.scene, facts, capture.seeds)
         self.state.to(device)
         optimized = self.state.groups()
         self.optimizers = {name: settings.rates[name][0].adam(group) for name, group in optimized.items()}

@@ -18,6 +18,7 @@ from lang3dxl_ns.open_scene import load_scene
 from lang3dxl_ns.plugin.run_checkpoint import read_checkpoint
 from lang3dxl_ns.plugin.run_settings import TRUST_VARIABLE, check_command_line
 from lang3dxl_ns.plugin.trainer_config import open_run, read_config
+from lang3dxl_ns.scene import capture
 
 TRAPS = [
     "!!python/object/apply:os.system ['touch {trap}']",
@@ -152,9 +153,12 @@ def test_every_method_of_nerfstudio_passes(tmp_path, method):
     check_command_line(["--load-config"])
 
 
-def test_a_run_opens_without_nerfstudios_reader_wherever_it_lies(copy):
+def test_a_run_opens_without_nerfstudios_reader_wherever_it_lies(copy, monkeypatch):
+    """And reads its photos' model once."""
+    read, models = capture._of_model, []
+    monkeypatch.setattr(capture, "_of_model", lambda *given: models.append(given[1]) or read(*given))
     config, pipeline, step = open_run(copy / "config.yml")
-    assert step == 1 and config.get_base_dir() == copy
+    assert step == 1 and config.get_base_dir() == copy and len(models) == 1
     assert pipeline.datamanager.get_datapath() == copy
     assert not pipeline.training
 

@@ -57,15 +57,15 @@ def test_what_is_trained_with_the_scene_may_set_its_weights():
     config = changed("pipeline.model.decoder.name", "paper")
     config.pipeline.model.clip_weight = 0.0
     config.pipeline.datamanager.regions = "felzenszwalb"
-    check_inert(config.pipeline.model, config.pipeline.datamanager)
+    check_inert(config.pipeline.model, config.pipeline.datamanager, config.optimizers)
     plain = changed("pipeline.datamanager.regions", "none")
-    check_inert(plain.pipeline.model, plain.pipeline.datamanager)
+    check_inert(plain.pipeline.model, plain.pipeline.datamanager, plain.optimizers)
 
 
 def test_an_unknown_decoder_is_refused_with_the_names_there_are():
     config = changed("pipeline.model.decoder.name", "fancy")
     with pytest.raises(UserError, match="unknown feature decoder 'fancy': choose one of gathered, paper"):
-        check_inert(config.pipeline.model, config.pipeline.datamanager)
+        check_inert(config.pipeline.model, config.pipeline.datamanager, config.optimizers)
 
 
 def test_rates_of_semantics_that_are_trained_with_the_scene_are_an_error_without_them(tmp_path):

@@ -219,7 +219,7 @@ def test_while_the_model_learns_its_words_are_gathered_when_they_are_asked_for(t
     codes = model.gauss_params["codes"]
 
     def learn():
-        learned.append(model.step)
+        learned.append(model.run.step)
         model.gauss_params["codes"] = codes
 
     conversation = session.Conversation(
@@ -234,11 +234,11 @@ def test_while_the_model_learns_its_words_are_gathered_when_they_are_asked_for(t
     )
     conversation.ask("dome")
     before = conversation._scene
-    assert learned == [model.step] and "still learns" in conversation.status()
+    assert learned == [model.run.step] and "still learns" in conversation.status()
     assert conversation.find()[0].views
     conversation.ask("dome")
     assert len(learned) == 1  # of the same model
-    model.step += 10
+    model.run.step += 10
     conversation.ask("dome")
     assert len(learned) == 2
     assert conversation._scene is not before and conversation._scene.cache is None

@@ -73,7 +73,7 @@ def test_trained_it_is_gaussians_like_any_others(train, scene):
     """A view looks the same with and without what only training needs, harmonics of colors or none."""
     for view_dependence in ("on", "off"):
         model = trained(train, scene, pipeline__model__view_dependence=view_dependence).eval()
-        model.step = 10_000
+        model.run.step = 10_000
         dc, sky = model.gauss_params["features_dc"][:COUNT], model.sky.colors
         shown = colors_seen(model.gauss_params, model.run.degree, torch.zeros(3))[:COUNT]
         torch.testing.assert_close(shown, sky.clamp(1e-4, 1 - 1e-4), atol=1e-4, rtol=0)
