@@ -188,9 +188,8 @@ def test_code_maps_are_decoded_at_five_sizes(default):
     assert (min(sizes), max(sizes)) == model.config.decode_size
 
 
-@pytest.mark.parametrize(
-    "name", [name if name == "fmgs" else pytest.param(name, marks=pytest.mark.nightly) for name in BASELINES]
-)
+@pytest.mark.nightly
+@pytest.mark.parametrize("name", BASELINES)
 def test_every_decoder_trains(trained, name, monkeypatch):
     monkeypatch.setattr(langsplat, "_STEPS", 5)
     trained(2, pipeline__model__decoder__name=name, pipeline__model__densify_until=0.0)

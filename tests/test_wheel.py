@@ -1,5 +1,6 @@
 """Wheel and sdist: the same bytes each time, all that a checkout has; commands run from the wheel alone."""
 
+import json
 import os
 import re
 import shutil
@@ -92,20 +93,32 @@ def test_commands_run_from_it_alone(wheel, tmp_path):
     assert {path.name for path in page.iterdir()} >= {"index.html", "page.js", "splats.js", "LICENSES.txt"}
 
 
+ENDS = """
+import io, json, sys
+from contextlib import redirect_stdout
+from lang3dxl_ns.cli import main
+for words in sys.argv[1:]:
+    try:
+        with redirect_stdout(io.StringIO()) as said:
+            main(words.split())
+    except SystemExit as end:
+        print(json.dumps([str(end), said.getvalue()]))
+"""
+"""Runs commands one after the other; says how each ended, and what it printed."""
+
+
 def test_commands_of_a_checkout_are_listed_and_tell_the_remedy(wheel, tmp_path):
     zipfile.ZipFile(wheel).extractall(tmp_path)
-
-    def lang3dxl(*words: str) -> subprocess.CompletedProcess:
-        command = [sys.executable, "-m", "lang3dxl_ns.cli", *words]
-        return subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=100)
-
-    for listed, words in (("numerics", ["--help"]), ("ablation", ["benchmark", "--help"])):
-        helped = lang3dxl(*words)
-        assert helped.returncode == 0 and f"• {listed} " in helped.stdout
-    for words in (["numerics"], ["benchmark", "ablation"], ["demo-scene"], ["demo"]):
-        refused = lang3dxl(*words, "--out", "report")
-        assert refused.returncode == 1
-        assert refused.stderr.startswith("Error: this command comes with a checkout of the repository")
+    commands = [f"{name} --out report" for name in ("numerics", "benchmark ablation", "demo-scene", "demo")]
+    words = [sys.executable, "-c", ENDS, "--help", "benchmark --help", *commands]
+    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, timeout=100)
+    ends = [json.loads(line) for line in done.stdout.splitlines()]
+    helped, refused = ends[:2], ends[2:]
+    assert len(refused) == 4, done.stderr
+    for (end, said), listed in zip(helped, ("numerics", "ablation"), strict=True):
+        assert end == "0" and f"• {listed} " in said
+    for end, _ in refused:
+        assert end.startswith("Error: this command comes with a checkout of the repository")
 
 
 def test_the_version_is_the_same_everywhere(wheel):

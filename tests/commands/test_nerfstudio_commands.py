@@ -1,6 +1,6 @@
 """nerfstudio's commands on our method, as in the README.
 
-A shell starts `ns-train`; the others import what it does, and find the method as it does.
+They run in processes that have the libraries; tests/test_layers.py starts nerfstudio as a shell does.
 """
 
 import json
@@ -41,16 +41,8 @@ def run(scene, tiny_clip, tiny_dense, folder) -> Path:
         *("--pipeline.datamanager.clip", tiny_clip, "--pipeline.datamanager.dense", tiny_dense, *FEW),
         *("--output-dir", folder / "outputs", "--timestamp", "first"),
         cwd=folder,
-        shell=True,
     )
     return folder / "outputs" / scene.name / "lang3dxl" / "first"
-
-
-def test_prepare_alone(scene, tiny_clip, tiny_dense, folder):
-    words = ("lang3dxl", "prepare", "--data", scene, "--clip", tiny_clip, "--dense", tiny_dense)
-    words += ("--cache-dir", folder / "cache")
-    assert "preparing 10 photos" in command(*words, cwd=folder)
-    assert "preparing" not in command(*words, cwd=folder)
 
 
 def test_eval(run, folder):
@@ -58,17 +50,6 @@ def test_eval(run, folder):
     command(*words, cwd=folder)
     results = json.loads((folder / "eval.json").read_text())["results"]
     assert {"psnr", "ssim", "clip_l1", "clip_psnr", "clip_cosine", "psnr_std"} <= set(results)
-
-
-def test_resume(run, scene, tiny_clip, tiny_dense, folder):
-    output = command(
-        *("ns-train", "lang3dxl", "--data", scene, "--max-num-iterations", 12, "--vis", "tensorboard"),
-        *("--pipeline.datamanager.clip", tiny_clip, "--pipeline.datamanager.dense", tiny_dense, *FEW),
-        *("--output-dir", folder / "outputs", "--timestamp", "second"),
-        *("--load-dir", run / "nerfstudio_models"),
-        cwd=folder,
-    )
-    assert "Resuming at iteration 8 of 12" in output
 
 
 @pytest.fixture
@@ -81,12 +62,11 @@ def camera_path(folder) -> Path:
     return folder / "path.json"
 
 
-@pytest.mark.parametrize("views", ["interpolate", "dataset", "camera-path"])
+@pytest.mark.parametrize("views", ["dataset", "camera-path"])
 def test_render_shows_what_is_asked_for(run, folder, camera_path, monkeypatch, views):
     monkeypatch.setenv("LANG3DXL_QUERY", "rose window; dome")
     target = folder / f"rendered-{views}"
     words = {
-        "interpolate": ("--interpolation-steps", 2, "--output-format", "images"),
         "dataset": ("--split", "test"),
         "camera-path": ("--camera-path-filename", camera_path, "--output-format", "images"),
     }[views]
@@ -101,9 +81,7 @@ def test_render_shows_what_is_asked_for(run, folder, camera_path, monkeypatch, v
         assert {path.parts[1] for path in pictures} == outputs
     else:  # the outputs side by side
         with Image.open(target / pictures[0]) as picture:
-            assert picture.width % 6 == 0 and picture.width > picture.height
-    if views == "camera-path":
-        assert len(pictures) == 2 and picture.size == (6 * 48, 32)
+            assert len(pictures) == 2 and picture.size == (6 * 48, 32)
 
 
 def test_export_splat(run, folder):

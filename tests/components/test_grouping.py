@@ -69,12 +69,6 @@ def test_few_gaussians(count):
     assert after.shape == features.shape and after.isfinite().all()
 
 
-@pytest.mark.filterwarnings("ignore:Number of distinct clusters")
-def test_one_look():
-    features, dense, mass, _ = scene()
-    assert sharpen(features, 0 * dense, mass).isfinite().all()
-
-
 def test_how_many_are_read_at_a_time_does_not_matter(monkeypatch):
     features, dense, mass, _ = scene()
     expected = sharpen(features, dense, mass)

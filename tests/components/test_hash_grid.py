@@ -46,17 +46,6 @@ def test_values_and_gradients_equal_the_reference(dim, spread):
     torch.testing.assert_close(gradients, right)
 
 
-@pytest.mark.parametrize("dim", [2, 3, 4])
-def test_gradients_equal_finite_differences(dim):
-    grid = make_grid(dim, levels=3, highest=14)
-    x = make_points(5, dim).requires_grad_()
-
-    def features(x, table):
-        return torch.func.functional_call(grid, {"table": table}, (x,))
-
-    assert torch.autograd.gradcheck(features, (x, grid.table), eps=1e-7, fast_mode=True)
-
-
 @pytest.mark.parametrize("value", [0.0, 1.0, 0.5, 0.25])
 def test_coordinates_have_a_gradient_at_the_ends_of_the_range_and_on_vertices(value):
     grid = make_grid(levels=1, lowest=4, highest=4)  # two cells to the unit: 0.25 and 0.75 lie on vertices

@@ -11,10 +11,6 @@ def seeded(*size, seed=0, dtype=torch.float64):
     return torch.rand(*size, dtype=dtype, generator=torch.Generator().manual_seed(seed))
 
 
-def labels_of(*size, count, seed=0):
-    return torch.randint(-1, count, size, generator=torch.Generator().manual_seed(seed))
-
-
 # ------------------------------------------------------------------ colors
 
 
@@ -64,30 +60,6 @@ def test_dense_loss_keeps_positions_within_a_tenth_of_a_cell_on_any_two_grids(si
     assert dense_loss(wave(*size), wave(*grid)).item() < 0.1 * cell * mean_slope
     shifted = dense_loss(wave(*size) + 2, wave(*grid))
     assert shifted.item() == pytest.approx(2, abs=1e-6)
-
-
-# ------------------------------------------------------------------ regions
-
-
-def region_variance_by_loops(features, labels, mask=None):
-    valid = labels >= 0 if mask is None else (labels >= 0) & mask
-    total = features.new_zeros(())
-    for label in set(labels[valid].tolist()):
-        pixels = features[valid & (labels == label)]
-        total = total + ((pixels - pixels.mean(0)) ** 2).sum()
-    return total / valid.sum()
-
-
-@pytest.mark.parametrize("masked", [False, True])
-def test_region_variance_equals_a_loop_over_regions_in_value_and_gradient(masked):
-    labels = labels_of(15, 17, count=6)
-    mask = seeded(15, 17, seed=3) > 0.4 if masked else None
-    results = []
-    for loss in (region_variance_loss, region_variance_by_loops):
-        features = seeded(15, 17, 5).requires_grad_()
-        value = loss(features, labels, mask)
-        results.append((value.detach(), *torch.autograd.grad(value, features)))
-    torch.testing.assert_close(*results)
 
 
 def test_losses_keep_the_type_of_the_prediction():

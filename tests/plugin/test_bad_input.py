@@ -81,7 +81,7 @@ def test_photos_that_are_missing_damaged_or_of_another_size_are_left_out_and_nam
 def test_truncated_photo_does_not_end_the_run(start, folder, capsys, semantics):
     photo = sorted((folder / "images").iterdir())[1]
     photo.write_bytes(photo.read_bytes()[:-400])
-    trainer = start(folder, semantics, iterations=24)
+    trainer = start(folder, semantics, iterations=12)
     assert photo.name in capsys.readouterr().out
     dataset = trainer.pipeline.datamanager.train_dataset
     index = [p.name for p in dataset.photos].index(photo.name)

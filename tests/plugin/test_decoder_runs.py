@@ -1,4 +1,4 @@
-"""Training runs of the baselines."""
+"""Training runs of the decoders. lab/tests/test_baselines.py has those of the laboratory."""
 
 from functools import cache
 
@@ -7,7 +7,6 @@ import torch
 from nerfstudio.utils.eval_utils import eval_setup
 from runs import train_run
 
-from lab.baselines import BASELINES, langsplat
 from lang3dxl_ns.components.decoders import DecoderConfig
 from lang3dxl_ns.components.field_settings import CompressionConfig, SemanticFieldConfig
 from lang3dxl_ns.evaluation.score_run import score_features
@@ -18,29 +17,19 @@ from lang3dxl_ns.training.snapshot import snapshot
 
 @pytest.fixture(scope="module")
 def run(scene, tiny_clip, tiny_dense, tmp_path_factory):
-    """The finished short run of a decoder by name, "none" for colors alone; each is made once."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(langsplat, "_STEPS", 20)
-        yield runs(scene, tiny_clip, tiny_dense, tmp_path_factory)
-
-
-def runs(scene, tiny_clip, tiny_dense, tmp_path_factory):
+    """The finished short run of a decoder by name; each is made once."""
 
     @cache
     def made(name: str, dense: bool = True):
-        semantics = name != "none"
-        few = CompressionConfig(steps=40, batch=512)
-        decoder = DecoderConfig(name, few) if semantics else DecoderConfig()
-        changes = {"pipeline__model__decoder": decoder}
+        changes = {"pipeline__model__decoder": DecoderConfig(name, CompressionConfig(steps=40, batch=512))}
         if not dense:
             changes["pipeline__datamanager__dense"] = "none"
-        folder = tmp_path_factory.mktemp(name)
-        return train_run(scene, tiny_clip, tiny_dense, folder, 6, semantics, **changes)
+        return train_run(scene, tiny_clip, tiny_dense, tmp_path_factory.mktemp(name), 6, **changes)
 
     return made
 
 
-@pytest.mark.parametrize("name", ["gathered", "paper", *BASELINES])
+@pytest.mark.parametrize("name", ["gathered", "paper"])
 def test_a_decoder_trains_gives_features_of_the_targets_width_and_is_the_same_once_loaded(run, name):
     trainer = run(name)
     model = trainer.pipeline.model.eval()
@@ -51,8 +40,7 @@ def test_a_decoder_trains_gives_features_of_the_targets_width_and_is_the_same_on
     run, data = model.run, trainer.pipeline.datamanager.data
     side, view = model.config.decode_size[1], photo_camera(camera).camera()
     metrics = score_features(snapshot(run, data.record()), run.parts.semantics, view, batch, side)
-    without_dense = name in ("langsplat", "gathered", "lifting")
-    assert metrics["clip_l1"] < 10 and ("dense_l1" in metrics) is not without_dense
+    assert metrics["clip_l1"] < 10 and ("dense_l1" in metrics) is (name == "paper")
     _, pipeline, _, _ = eval_setup(trainer.base_dir / "config.yml", test_mode="inference")
     loaded = pipeline.model.eval()
     with torch.no_grad():
@@ -60,26 +48,8 @@ def test_a_decoder_trains_gives_features_of_the_targets_width_and_is_the_same_on
     torch.testing.assert_close(*maps)
 
 
-@pytest.mark.parametrize("name", ["feature3dgs", "fmgs", "direct"])
-def test_what_a_decoder_trains_moves_and_geometry_is_left_to_the_colors(run, name):
-    alone = run("none").pipeline.model
-    model = run(name).pipeline.model
-    torch.testing.assert_close(model.means, alone.means)
-    if "codes" in model.gauss_params:
-        assert model.gauss_params["codes"].abs().max() > 0
-    trained = [p for group in model.semantic_field.parameter_groups().values() for p in group]
-    assert all(p.grad is not None and p.grad.abs().max() > 0 for p in trained)
-
-
-def test_only_fmgs_has_an_alignment_loss(run):
-    for name in ("gathered", "fmgs"):
-        trainer = run(name)
-        assert ("alignment" in trainer.pipeline.last_losses) is (name == "fmgs")
-
-
-@pytest.mark.parametrize("name", ["gathered", "lifting"])
-def test_gathered_features_come_near_the_targets_and_nothing_is_learned_before(run, name):
-    trainer = run(name)
+def test_gathered_features_come_near_the_targets_and_nothing_is_learned_before(run):
+    trainer = run("gathered")
     assert set(trainer.pipeline.last_losses) == {"rgb"}
     datamanager = trainer.pipeline.datamanager
     assert set(datamanager.next_train(0)[1]) == {"image", "image_idx", "name"}  # no step waits for a target
@@ -91,7 +61,7 @@ def test_gathered_features_come_near_the_targets_and_nothing_is_learned_before(r
 
 
 def test_dense_features_sharpen_words_and_leave_all_else_as_it_is(run):
-    sharp, without = (dict(run("lifting", dense).pipeline.model.gauss_params) for dense in (True, False))
+    sharp, without = (dict(run("gathered", dense).pipeline.model.gauss_params) for dense in (True, False))
     codes, others = sharp.pop("codes"), without.pop("codes")
     assert codes.shape == others.shape and (codes != others).any()
     for name, value in sharp.items():

@@ -20,6 +20,7 @@ import lang3dxl_ns
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.evaluation.scores import open_scorer
 from lang3dxl_ns.files.scene_file import describe_scene_file, keep_words, read_scene
+from lang3dxl_ns.plugin.trainer_config import open_run
 from lang3dxl_ns.query.answer import relevancy_maps
 from lang3dxl_ns.query.relevancy import TEMPERATURE
 from lang3dxl_ns.rendering import Gaussians, rasterize, spherical_harmonics
@@ -287,9 +288,11 @@ def test_a_run_of_a_version_whose_settings_were_in_other_modules_can_be_asked(tr
     assert lang3dxl_ns.load_scene(config).query("dome").relevancy.any()
 
 
-def test_a_run_that_trains_on_all_photos_leaves_a_scene_that_opens(train, scene_photos):
+def test_a_run_that_trains_on_all_photos_leaves_a_scene_that_opens_and_opens_without_them(train, tmp_path):
     """The same photos are held out, then; the file lists each once."""
-    trained = train(scene_photos, iterations=2, pipeline__datamanager__dataparser__eval_mode="all")
-    (path,) = trained.base_dir.glob("*.scene")
-    photos = read_scene(path).photos
-    assert len(photos) == 6 and {photo.split for photo in photos} == {"train"}
+    data = write_scene(tmp_path / "photos", photos=4, points=60)
+    run = train(data, 2, tmp_path / "out", pipeline__datamanager__dataparser__eval_mode="all").base_dir
+    photos = read_scene(run / "photos.scene").photos
+    assert len(photos) == 4 and {photo.split for photo in photos} == {"train"}
+    shutil.rmtree(data)
+    assert open_run(run)[1].datamanager.train_dataset.photos

@@ -117,11 +117,6 @@ def test_codes_from_photos_say_at_once_what_noise_has_to_learn(train, scene):
     assert clip_loss("photos") < 0.95 * clip_loss("noise")
 
 
-def test_resuming_a_finished_run_says_so(train, scene, finished):
-    with pytest.raises(UserError, match="max-num-iterations"):
-        train(scene, iterations=6, load_dir=finished.checkpoint_dir)
-
-
 def test_evaluation_of_a_checkpoint_gives_what_the_trainer_gave(finished):
     expected = finished.pipeline.get_average_eval_image_metrics()
     _, pipeline, _, _ = eval_setup(finished.base_dir / "config.yml")

@@ -215,8 +215,7 @@ def test_an_entry_with_a_flipped_bit_or_without_its_checksum_is_damaged(store, c
     assert not store.is_current("clip", "a.jpg", {"made": "before checksums"})
 
 
-@pytest.mark.parametrize("second", [None, 1_700_000_000])
-def test_an_altered_entry_is_found_whatever_its_time(store, second):
+def test_an_altered_entry_is_found_whatever_its_time(store):
     """Archives and some disks keep times in whole seconds."""
     store.write("clip", "a.jpg", entry(), SETTINGS)
     path = store.path("clip", "a.jpg")
@@ -224,8 +223,7 @@ def test_an_altered_entry_is_found_whatever_its_time(store, second):
     content = bytearray(path.read_bytes())
     content[-1] ^= 1
     path.write_bytes(bytes(content))
-    if second is not None:
-        os.utime(path, (second, second))
+    os.utime(path, (1_700_000_000, 1_700_000_000))
     assert not store.is_current("clip", "a.jpg", SETTINGS)
 
 

@@ -65,7 +65,7 @@ class Counting(ScoredRuns):
 
 
 def test_a_finished_run_is_not_made_again_and_one_with_other_settings_is(tmp_path):
-    made: list[str] = []
+    made = list[str]()
     runs = runs_of(FULL, "fmgs")
     first, _ = make_all(runs, Counting(tmp_path, made), lambda *_: None)
     assert made == ["here/full/1200-0", "here/fmgs/1200-0"]
@@ -77,7 +77,7 @@ def test_a_finished_run_is_not_made_again_and_one_with_other_settings_is(tmp_pat
 
 
 def test_a_run_that_fails_says_why_and_is_tried_again_and_others_go_on(tmp_path):
-    made: list[str] = []
+    made = list[str]()
     runs = runs_of(CLIPSEG, FULL)
     figures, failed = make_all(runs, Counting(tmp_path, made, fails=(CLIPSEG,)), lambda *_: None)
     assert [run.row.name for run in figures] == [FULL]
@@ -88,7 +88,7 @@ def test_a_run_that_fails_says_why_and_is_tried_again_and_others_go_on(tmp_path)
 
 
 def test_a_stopped_run_gives_no_result(tmp_path, monkeypatch):
-    made: list[str] = []
+    made = list[str]()
     store = Counting(tmp_path, made)
 
     def stop(run, log):
@@ -120,14 +120,14 @@ def test_a_stopped_comparison_has_every_row_on_every_scene_once_before_any_twice
     rows = [BY_NAME[name] for name in (FULL, "fmgs", CLIPSEG, TEACHER)]
     runs = Ablation(tmp_path, seeds=2, steps=(6, 4)).runs(scenes, rows)
     assert [run.seed for run in runs] == [0] * 10 + [1] * 8  # segmenters once, bounds never
-    made: list[str] = []
+    made = list[str]()
     make_all(runs[:3], Counting(tmp_path, made), lambda *_: None)
     make_all(runs, Counting(tmp_path, made), lambda *_: None)
     assert sorted(made) == sorted(run.name for run in runs)
 
 
 def test_clipsegs_folder_decides_about_its_own_row_alone(tmp_path):
-    made: list[str] = []
+    made = list[str]()
     runs = runs_of(FULL, CLIPSEG, LANGSAM)
     for folder in ("here", "there"):
         store = Counting(tmp_path, made)
@@ -262,7 +262,7 @@ def test_the_front_holds_rows_unbeaten_in_time_and_quality():
 
 
 def test_new_weights_of_the_same_name_make_runs_anew(tmp_path, monkeypatch):
-    made: list[str] = []
+    made = list[str]()
     make_all(runs_of(FULL), Counting(tmp_path, made), lambda *_: None)
     monkeypatch.setattr(ScoredRuns, "_clip_weights", "others")
     make_all(runs_of(FULL), Counting(tmp_path, made), lambda *_: None)
