@@ -11,7 +11,7 @@ from lang3dxl_ns.scene.colmap import read_reconstruction
 from lang3dxl_ns.training.snapshot import snapshot
 
 
-@pytest.fixture(params=["sceaux", "sceaux_wild"])
+@pytest.fixture(params=[pytest.param("sceaux", marks=pytest.mark.nightly), "sceaux_wild"])
 def real_scene(request, real_scenes, tmp_path):
     """A copy, since targets are kept beside the photos."""
     return shutil.copytree(
@@ -19,7 +19,7 @@ def real_scene(request, real_scenes, tmp_path):
     )
 
 
-@pytest.mark.nightly
+@pytest.mark.slow
 def test_a_short_run_shows_the_facade_and_beats_the_mean_feature(train, real_scene):
     trainer = train(
         real_scene,

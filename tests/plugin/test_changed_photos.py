@@ -1,5 +1,6 @@
 """Runs whose photos change, vanish or are damaged between their parts."""
 
+import shutil
 from copy import deepcopy
 from pathlib import Path
 
@@ -15,7 +16,7 @@ from lang3dxl_ns.files.scene_file import write_scene as write_scene_file
 from lang3dxl_ns.methods import lang3dxl
 from lang3dxl_ns.plugin.cameras import photo_camera
 from lang3dxl_ns.plugin.trainer import Lang3DXLTrainer
-from lang3dxl_ns.plugin.trainer_config import read_config
+from lang3dxl_ns.plugin.trainer_config import open_run, read_config
 from lang3dxl_ns.rendering import composite
 from lang3dxl_ns.scene.frame import Frame
 from lang3dxl_ns.scene.record import SCENE_FILE, SceneRecord
@@ -133,6 +134,13 @@ def test_a_held_out_photo_that_is_gone_does_not_end_the_training(train, tmp_path
     trainer = train(data, 6, semantics=False, steps_per_eval_image=3)
     assert trainer.step == 5
     assert "not evaluated at iteration 3" in " ".join(capsys.readouterr().out.split())
+
+
+def test_a_run_without_held_out_photos_opens_when_its_photos_are_gone(train, tmp_path):
+    data = write_scene(tmp_path / "photos", photos=4, points=60)
+    run = train(data, 2, tmp_path / "out", semantics=False, **{f"{PARSER}eval_mode": "all"}).base_dir
+    shutil.rmtree(data)
+    assert open_run(run)[1].datamanager.train_dataset.photos
 
 
 def test_a_training_photo_that_is_the_only_one_and_damaged_is_told(train, tmp_path):

@@ -63,13 +63,25 @@ def test_a_run_of_fewer_iterations_than_its_checkpoint_is_refused(trained, train
     assert not list((tmp_path / "refused").rglob("*.yml"))
 
 
-def test_ctrl_c_while_words_are_learned_ends_the_run_at_once(trained, monkeypatch):
+def test_words_of_a_run_that_is_prolonged_are_learned_anew(trained, train, scene, monkeypatch):
+    """Those of the checkpoint are out of date as soon as the Gaussians move."""
     run, folders = trained
-    learn = "lang3dxl_ns.plugin.pipeline.learn_words"
-    monkeypatch.setattr(learn, lambda *_: signal.raise_signal(signal.SIGINT))
+    run()
+    assert saved(folders[0])["words"]
+    monkeypatch.setattr(Lang3DXLPipeline, "learn_words", lambda self: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        train(scene, iterations=STEPS + 1, load_dir=folders[0])
+    (path,) = folders[1].glob("*.ckpt")
+    assert not torch.load(path, weights_only=True)["words"]
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_while_words_are_learned_ends_the_run_at_once(trained, monkeypatch, number, code):
+    run, folders = trained
+    monkeypatch.setattr("lang3dxl_ns.plugin.pipeline.learn_words", lambda *_: signal.raise_signal(number))
     with pytest.raises(SystemExit) as end:
         run()
-    assert end.value.code == 130
+    assert end.value.code == code
     assert not saved(folders[0])["words"]
 
 
@@ -90,13 +102,12 @@ def test_a_signal_while_training_saves_and_tells_the_shell(trained, monkeypatch,
     assert [path.name for path in folders[0].glob("*")] == ["step-000000001.ckpt"]
 
 
-def test_ctrl_c_ends_the_viewer_of_a_finished_run_without_a_word(trained, monkeypatch):
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_the_viewer_of_a_finished_run_without_a_word(trained, monkeypatch, number):
     run, folders = trained
     told = []
     monkeypatch.setattr(
-        Lang3DXLTrainer,
-        "_train_complete_viewer",
-        lambda _: (signal.raise_signal(signal.SIGINT), told.append(1)),
+        Lang3DXLTrainer, "_train_complete_viewer", lambda _: (signal.raise_signal(number), told.append(1))
     )
     run(semantics=False, viewer__quit_on_train_completion=False)
     assert not told  # it would have gone on for ever
@@ -142,6 +153,17 @@ def test_words_are_learned_under_the_lock_that_the_viewer_takes(trained, monkeyp
     run()
     assert locks == [True]
     assert not trainers[0].train_lock.locked()
+
+
+def test_the_time_announced_includes_the_words(trained, monkeypatch):
+    run, _ = trained
+    said: list[str] = []
+    monkeypatch.setattr("lang3dxl_ns.plugin.trainer.CONSOLE.log", lambda text, **_: said.append(str(text)))
+    monkeypatch.setattr("lang3dxl_ns.training.learn_codes.say", said.append)
+    run()
+    (line,) = (line for line in said if line.startswith("training: "))
+    assert "to learn words" in line
+    assert any("centered cosine" in line for line in said)
 
 
 def test_words_are_the_same_from_photos_gathered_smaller(trained, scene, monkeypatch):

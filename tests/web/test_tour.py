@@ -32,7 +32,7 @@ PLAYED = """async () => {
   };
   const watch = setInterval(() => seen(document.getElementById("caption")), 20);
   lang3dxl.clear();
-  await lang3dxl.tour.play(500);
+  await lang3dxl.tour.play(1500);
   clearInterval(watch);
   const longest = (times) => Object.entries(times).sort(([, a], [, b]) => b - a)[0][0]; // not a flight
   return stops.filter(([, words]) => words).map(([shown, words, times]) => [shown, words, longest(times)]);
