@@ -8,7 +8,7 @@ Gaussian (see `fused_compositing.Plan`). They are processed in waves of 32.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
@@ -78,9 +78,22 @@ class _Splat(NamedTuple):
     log2_opacity: float
 
 
-class _Wave(NamedTuple):
-    """The rows of a wave in order, each with a slot for every block that it reaches."""
+class _Centers(NamedTuple):
+    """Centers of a tile's pixels, counted from its corner."""
 
+    x: Float[np.ndarray, " pixels"]
+    y: Float[np.ndarray, " pixels"]
+    rows: Any
+    """Vector of the 16 pixel rows' y."""
+
+
+class _Wave(NamedTuple):
+    """What is known of a wave's rows once they are composited: one slot per row and block that it reaches."""
+
+    masks: Int[np.ndarray, " rows"]
+    """Blocks that each row reaches."""
+    starts: Int[np.ndarray, " rows+1"]
+    """First slot of each row."""
     places: Int[np.ndarray, " slots"]
     """First pixel of each slot's block."""
     alphas: Float[np.ndarray, " slots*lanes"]
@@ -106,14 +119,21 @@ def _place(pixel):
 
 @numba.njit
 def _pixel_centers(like):
-    """Return x and y of all blocks' pixels from the tile's corner, and y of the pixel rows."""
-    across, down, lines = _aligned(PIXELS, like), _aligned(PIXELS, like), _aligned(LANES, like)
+    x, y, rows = _aligned(PIXELS, like), _aligned(PIXELS, like), _aligned(LANES, like)
     for pixel in range(PIXELS):
         column, row = _place(pixel)
-        across[pixel], down[pixel] = column + 0.5, row + 0.5
+        x[pixel], y[pixel] = column + 0.5, row + 0.5
     for lane in range(LANES):
-        lines[lane] = lane + 0.5
-    return across, down, load(lines, 0)
+        rows[lane] = lane + 0.5
+    return _Centers(x, y, load(rows, 0))
+
+
+@numba.njit
+def _empty_wave(like):
+    masks, starts = np.empty(WAVE, np.int64), np.empty(WAVE + 1, np.int64)
+    places, room = np.empty(WAVE * _BLOCKS, np.int64), WAVE * PIXELS
+    alphas, weights, values = _aligned(room, like), _aligned(room, like), _aligned(room, like)
+    return _Wave(masks, starts, places, alphas, weights, values)
 
 
 @numba.njit
@@ -138,10 +158,10 @@ def _splat(splats, rank, corner_x, corner_y):
 
 
 @numba.njit(forceinline=True)
-def _blocks_reached(splat, lines):
+def _blocks_reached(splat, rows):
     """Return the mask of blocks in which a Gaussian reaches 1/255. Along a row of pixels, alpha is largest
     where dx = −shear·dy, or at the end nearest to it."""
-    dy = lines - splat.y
+    dy = rows - splat.y
     peak = dy * -splat.shear
     height = splat.log2_opacity - dy * dy * splat.rise
     left, right = 0.5 - splat.x, 0.5 + _BLOCK_WIDTH - splat.x
@@ -153,29 +173,27 @@ def _blocks_reached(splat, lines):
 
 
 @numba.njit(forceinline=True)
-def _reach(plan, begin, count, corner_x, corner_y, lines, masks):
+def _reach(plan, begin, count, corner_x, corner_y, rows, masks):
     """Compute the masks of one wave's rows together, which avoids stalls."""
     for k in range(count):
-        masks[k] = _blocks_reached(_splat(plan.splats, plan.ranks[begin + k], corner_x, corner_y), lines)
+        masks[k] = _blocks_reached(_splat(plan.splats, plan.ranks[begin + k], corner_x, corner_y), rows)
 
 
 @numba.njit(forceinline=True)
-def _alpha(dx, dy, splat):
+def _blend(splat, centers, at, transmittance):
+    """Put a Gaussian behind what a block's pixels show so far. Returns its alpha and its weight in them, and
+    which of them continue; stores the transmittance behind it."""
+    dx, dy = load(centers.x, at) - splat.x, load(centers.y, at) - splat.y
     slanted = dx + dy * splat.shear
     log2_alpha = (splat.log2_opacity - dy * dy * splat.rise) - slanted * slanted * splat.steepness
     alpha = minimum(exp2(maximum(log2_alpha, -20.0)), ALPHA_MAX)
-    return where(alpha >= ALPHA_MIN, alpha, 0.0)
-
-
-@numba.njit(forceinline=True)
-def _blend(transmittance, at, alpha):
-    """Return the weight in a block's pixels, and which of them continue. Stores the transmittance behind."""
+    alpha = where(alpha >= ALPHA_MIN, alpha, 0.0)
     before = load(transmittance, at)
     weight = before * alpha
     after = before - weight
     going = after > TRANSMITTANCE_MIN
     store(transmittance, at, where(going, after, 0.0))
-    return where(going, weight, 0.0), going
+    return where(going, alpha, 0.0), where(going, weight, 0.0), bits(going) != 0
 
 
 @kernel
@@ -183,8 +201,7 @@ def composite_tiles(tiles, plan, maps, trace, keep):
     """Composite some tiles of a `Plan` into the maps. `keep` also fills the trace for a backward pass."""
     channels = plan.table.shape[1]
     transmittance, sums = _aligned(PIXELS, plan.splats), _aligned(channels * PIXELS, plan.splats)
-    across, down, lines = _pixel_centers(plan.splats)
-    masks = np.empty(WAVE, np.int64)
+    centers, masks = _pixel_centers(plan.splats), np.empty(WAVE, np.int64)
     for tile in tiles:
         corner_x, corner_y, live = _blocks_inside(tile, plan.width, plan.height)
         transmittance[:] = 1
@@ -194,7 +211,7 @@ def composite_tiles(tiles, plan, maps, trace, keep):
             if keep:
                 trace.records[trace.wave_starts[tile] + wave] = transmittance
             count = min(WAVE, plan.starts[tile + 1] - begin)
-            _reach(plan, begin, count, corner_x, corner_y, lines, masks)
+            _reach(plan, begin, count, corner_x, corner_y, centers.rows, masks)
             for k in range(count):
                 todo = masks[k] & live
                 rank = plan.ranks[begin + k]
@@ -203,9 +220,8 @@ def composite_tiles(tiles, plan, maps, trace, keep):
                     block = lowest_bit(todo)
                     todo &= todo - 1
                     at = block * LANES
-                    alpha = _alpha(load(across, at) - splat.x, load(down, at) - splat.y, splat)
-                    weight, going = _blend(transmittance, at, alpha)
-                    if bits(going) == 0:
+                    _, weight, going = _blend(splat, centers, at, transmittance)
+                    if not going:
                         live &= ~(1 << block)
                     place, column = at * channels, rank * channels
                     for _ in range(0, channels, UNROLL):
@@ -230,59 +246,63 @@ def composite_tiles(tiles, plan, maps, trace, keep):
 @kernel
 def backward_tiles(tiles, plan, maps, trace, sums):
     """Sum the gradients of some tiles per visible Gaussian. `maps` has the gradients of the output maps.
-    Waves are processed from the back. In each, alpha and weight are recomputed front to back, then used in
-    reverse. With v = Σ channel × upstream, and B the same sum for everything behind, composited over black,
-    the gradient with respect to ln(alpha) is weight·(v − B), and B in front is B + alpha·(v − B)."""
+
+    Waves are processed from the back: each is composited again, front to back, and then walked in reverse.
+    With v = Σ channel × upstream, and B the same sum for everything behind, composited over black, the
+    gradient with respect to ln(alpha) is weight·(v − B), and B in front is B + alpha·(v − B)."""
     channels, like = plan.table.shape[1], plan.splats
     sums[:] = 0
     upstream = _aligned(channels * PIXELS, like)
     upstream[:] = 0
-    transmittance, behind, room = _aligned(PIXELS, like), _aligned(PIXELS, like), WAVE * PIXELS
-    alphas, weights, values = _aligned(room, like), _aligned(room, like), _aligned(room, like)
-    slots, places = np.empty(WAVE + 1, np.int64), np.empty(WAVE * _BLOCKS, np.int64)
-    found, masks = _Wave(places, alphas, weights, values), np.empty(WAVE, np.int64)
-    across, down, lines = _pixel_centers(like)
-    zero = lines * 0.0
+    transmittance, behind = _aligned(PIXELS, like), _aligned(PIXELS, like)
+    centers, wave = _pixel_centers(like), _empty_wave(like)
+    zero = centers.rows * 0.0
     for tile in tiles:
-        if not trace.ends[tile]:
+        rows = trace.ends[tile]
+        if not rows:
             continue
         corner_x, corner_y, inside = _blocks_inside(tile, plan.width, plan.height)
-        behind[:] = 0
         _read_upstream(plan, maps, corner_x, corner_y, upstream)
-        for wave in range((trace.ends[tile] - 1) // WAVE, -1, -1):
-            begin = plan.starts[tile] + wave * WAVE
-            count = min(WAVE, plan.starts[tile] + trace.ends[tile] - begin)
-            transmittance[:] = trace.records[trace.wave_starts[tile] + wave]
-            _reach(plan, begin, count, corner_x, corner_y, lines, masks)
-            live = inside
-            for block in range(_BLOCKS):
-                if not bits(load(transmittance, block * LANES) > 0.0):
-                    live &= ~(1 << block)
-            slot = 0
-            for k in range(count):
-                splat = _splat(plan.splats, plan.ranks[begin + k], corner_x, corner_y)
-                todo, slots[k] = masks[k] & live, slot
-                while todo:
-                    block = lowest_bit(todo)
-                    todo &= todo - 1
-                    at = block * LANES
-                    alpha = _alpha(load(across, at) - splat.x, load(down, at) - splat.y, splat)
-                    weight, going = _blend(transmittance, at, alpha)
-                    if bits(going) == 0:
-                        live &= ~(1 << block)
-                    places[slot] = at
-                    store(alphas, slot * LANES, where(going, alpha, 0.0))
-                    store(weights, slot * LANES, weight)
-                    slot += 1
-            slots[count] = slot
+        behind[:] = 0
+        for number in range((rows - 1) // WAVE, -1, -1):
+            begin = plan.starts[tile] + number * WAVE
+            count = min(WAVE, plan.starts[tile] + rows - begin)
+            transmittance[:] = trace.records[trace.wave_starts[tile] + number]
+            _composite_again(plan, begin, count, corner_x, corner_y, inside, centers, transmittance, wave)
             for k in range(count - 1, -1, -1):
-                first, last = slots[k], slots[k + 1]
+                first, last = wave.starts[k], wave.starts[k + 1]
                 if first < last:
                     rank = plan.ranks[begin + k]
                     splat = _splat(plan.splats, rank, corner_x, corner_y)
-                    _add_values(plan, upstream, rank, first, last, found)
-                    _add_shape(across, down, splat, first, last, found, behind, zero, sums[rank])
-                    _add_channels(upstream, first, last, found, channels, zero, sums[rank])
+                    _set_values(plan, upstream, rank, first, last, wave)
+                    _add_shape(centers, splat, first, last, wave, behind, zero, sums[rank])
+                    _add_channels(upstream, first, last, wave, channels, zero, sums[rank])
+
+
+@numba.njit(forceinline=True)
+def _composite_again(plan, begin, count, corner_x, corner_y, inside, centers, transmittance, wave):
+    """Composite the rows of one wave, from the transmittance in front of it, and keep alphas and weights."""
+    live = inside
+    for block in range(_BLOCKS):
+        if not bits(load(transmittance, block * LANES) > 0.0):
+            live &= ~(1 << block)
+    _reach(plan, begin, count, corner_x, corner_y, centers.rows, wave.masks)
+    slot = 0
+    for k in range(count):
+        splat = _splat(plan.splats, plan.ranks[begin + k], corner_x, corner_y)
+        todo, wave.starts[k] = wave.masks[k] & live, slot
+        while todo:
+            block = lowest_bit(todo)
+            todo &= todo - 1
+            at = block * LANES
+            alpha, weight, going = _blend(splat, centers, at, transmittance)
+            if not going:
+                live &= ~(1 << block)
+            wave.places[slot] = at
+            store(wave.alphas, slot * LANES, alpha)
+            store(wave.weights, slot * LANES, weight)
+            slot += 1
+    wave.starts[count] = slot
 
 
 @numba.njit(forceinline=True)
@@ -300,33 +320,33 @@ def _read_upstream(plan, maps, corner_x, corner_y, upstream):
 
 
 @numba.njit(forceinline=True)
-def _add_values(plan, upstream, rank, first, last, found):
-    """Compute Σ channel × upstream of a row."""
+def _set_values(plan, upstream, rank, first, last, wave):
+    """Compute Σ channel × upstream in a row's slots."""
     channels = plan.table.shape[1]
     for c in range(0, channels, UNROLL):
         column = rank * channels + c
         for slot in range(first, last):
-            at = entry(found.places, slot) * channels + c * LANES
+            at = entry(wave.places, slot) * channels + c * LANES
             value = load(upstream, at) * entry(plan.table, column)
             value += load(upstream, at + LANES) * entry(plan.table, column + 1)
             value += load(upstream, at + 2 * LANES) * entry(plan.table, column + 2)
             value += load(upstream, at + 3 * LANES) * entry(plan.table, column + 3)
             if c:
-                value += load(found.values, slot * LANES)
-            store(found.values, slot * LANES, value)
+                value += load(wave.values, slot * LANES)
+            store(wave.values, slot * LANES, value)
 
 
 @numba.njit(forceinline=True)
-def _add_shape(across, down, splat, first, last, found, behind, zero, sums):
+def _add_shape(centers, splat, first, last, wave, behind, zero, sums):
     """Add the moments of a row's gradients (see `CHANNELS_FROM`), and move `behind` in front of it."""
     m, mu, my, muu, muy, myy = zero, zero, zero, zero, zero, zero
     for slot in range(first, last):
-        at = entry(found.places, slot)
-        dx, dy = load(across, at) - splat.x, load(down, at) - splat.y
-        back, alpha = load(behind, at), load(found.alphas, slot * LANES)
-        over = load(found.values, slot * LANES) - back
+        at = entry(wave.places, slot)
+        dx, dy = load(centers.x, at) - splat.x, load(centers.y, at) - splat.y
+        back, alpha = load(behind, at), load(wave.alphas, slot * LANES)
+        over = load(wave.values, slot * LANES) - back
         store(behind, at, back + alpha * over)
-        slope = where(alpha < ALPHA_MAX, load(found.weights, slot * LANES) * over, 0.0)
+        slope = where(alpha < ALPHA_MAX, load(wave.weights, slot * LANES) * over, 0.0)
         slanted = dx + dy * splat.shear
         slope_u, slope_y = slope * slanted, slope * dy
         m += slope
@@ -344,12 +364,12 @@ def _add_shape(across, down, splat, first, last, found, behind, zero, sums):
 
 
 @numba.njit(forceinline=True)
-def _add_channels(upstream, first, last, found, channels, zero, sums):
+def _add_channels(upstream, first, last, wave, channels, zero, sums):
     """Add the gradients of a row's channels."""
     for c in range(0, channels, UNROLL):
         g0, g1, g2, g3 = zero, zero, zero, zero
         for slot in range(first, last):
-            at, weight = entry(found.places, slot) * channels + c * LANES, load(found.weights, slot * LANES)
+            at, weight = entry(wave.places, slot) * channels + c * LANES, load(wave.weights, slot * LANES)
             g0 += load(upstream, at) * weight
             g1 += load(upstream, at + LANES) * weight
             g2 += load(upstream, at + 2 * LANES) * weight
