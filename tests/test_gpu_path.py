@@ -347,15 +347,14 @@ def test_a_conversation_in_the_viewer(default, gpu):
     from scenes import view_of
 
     from lang3dxl_ns.training.conversation import Conversation
-    from lang3dxl_ns.training.snapshot import snapshot
+    from lang3dxl_ns.training.snapshot import Snapshots, snapshot
 
     pipeline = default.pipeline
     model = pipeline.model.eval()
     with gpu():
-        session = Conversation(
-            model.run, pipeline.scene_file, default.base_dir, nullcontext(), lambda: False, lambda: None,
-            lambda: {"rgb"}, lambda _: None,
-        )  # fmt: skip
+        nothing = {"learning": lambda: False, "learn": lambda: None, "watch": lambda _: None}
+        snapshots = Snapshots(model.run, pipeline.scene_file, default.base_dir, nullcontext(), **nothing)
+        session = Conversation(snapshots, lambda: {"rgb"})
         session.ask("tower")
         model.answers = session
         camera = pipeline.scene_file.photos[0].camera

@@ -140,7 +140,6 @@ STILL_ANY = {
     *("files/scene_file.py kind", "rendering/simd.py kind"),  # of NumPy and numba
     "plugin/run_settings.py settings",  # of any class
     *("plugin/wrong_flags.py settings", "training/fit.py settings"),
-    "query/scene.py place",
 }
 """Names that are annotated Any although other modules use them for classes of this package."""
 

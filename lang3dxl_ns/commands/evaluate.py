@@ -9,11 +9,12 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
+from lang3dxl_ns.commands.of_scene import OfScene
 from lang3dxl_ns.common.console import say, some
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import read_names, write_atomically
 from lang3dxl_ns.common.reports import describe_machine, markdown_table, write_report
-from lang3dxl_ns.common.settings_help import OfScene, showing
+from lang3dxl_ns.common.settings_help import showing
 from lang3dxl_ns.evaluation.aggregate import average, pool, pooled_table, read_results, scene_table
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth, Layout, held_out_photos
 

@@ -9,11 +9,12 @@ from typing import Annotated
 
 import tyro
 
+from lang3dxl_ns.commands.of_scene import OfScene
 from lang3dxl_ns.commands.query import Negatives, parse_texts
 from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import make_folder, read_names
-from lang3dxl_ns.common.settings_help import OfScene, showing
+from lang3dxl_ns.common.settings_help import showing
 from lang3dxl_ns.files.scene_file import Provenance, check_scene_name, replace_scene
 from lang3dxl_ns.files.splat_file import check_splat_name
 from lang3dxl_ns.open_scene import load_scene, provenance_of

@@ -12,10 +12,11 @@ import numpy as np
 import tyro
 from PIL import Image
 
+from lang3dxl_ns.commands.of_scene import OfScene
 from lang3dxl_ns.common.console import say, some, tracked
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import make_folder, replace_file, slugs
-from lang3dxl_ns.common.settings_help import OfScene, showing
+from lang3dxl_ns.common.settings_help import showing
 from lang3dxl_ns.files.coco import CocoLabels, check_labels_file
 from lang3dxl_ns.open_scene import load_scene
 from lang3dxl_ns.query.answer import best_views

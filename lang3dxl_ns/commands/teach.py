@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 import tyro
 
+from lang3dxl_ns.commands.of_scene import OfScene
 from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import file_locked
-from lang3dxl_ns.common.settings_help import OfScene, showing
+from lang3dxl_ns.common.settings_help import showing
 
 if TYPE_CHECKING:
     from lang3dxl_ns.query.scene import Scene

@@ -7,9 +7,10 @@ from pathlib import Path
 
 import tyro
 
+from lang3dxl_ns.commands.of_scene import OfScene
 from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.common.settings_help import OfScene, showing
+from lang3dxl_ns.common.settings_help import showing
 
 
 @showing("scene", "text", "ask", "out", "splats", "view")

@@ -11,10 +11,11 @@ from pathlib import Path
 
 import tyro
 
+from lang3dxl_ns.commands.of_scene import OfScene
 from lang3dxl_ns.common.checks import check_address
 from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.common.settings_help import OfScene, showing
+from lang3dxl_ns.common.settings_help import showing
 
 
 @showing("scene", "text", "photos", "tour", "host", "port", "browser")

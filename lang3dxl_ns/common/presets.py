@@ -5,8 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from lang3dxl_ns.common.errors import UserError, readable
 
 _PACKAGE = Path(__file__).parents[1]
@@ -20,6 +18,8 @@ def load_preset(name: str) -> dict[str, Any]:
     known = sorted(path.relative_to(FOLDER).with_suffix("").as_posix() for path in FOLDER.rglob("*.yaml"))
     if name not in known:
         raise UserError(f"there is no preset {name!r}: choose one of {', '.join(known)}")
+    import yaml
+
     with readable(f"{FOLDER / name}.yaml can't be read", "restore it", (yaml.YAMLError, ValueError)):
         settings = yaml.safe_load((FOLDER / f"{name}.yaml").read_text())
     if not isinstance(settings, dict):

@@ -4,28 +4,17 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, fields
-from pathlib import Path
+from dataclasses import fields
 from types import NoneType
 from typing import Annotated, Any, TypeVar, get_args, get_type_hints
-
-import tyro
 
 Class = TypeVar("Class", bound=type)
 
 
-@dataclass(kw_only=True)
-class OfScene:
-    """Settings of every command about a scene."""
-
-    scene: tyro.conf.Positional[Path | None] = None
-    """A .scene file, a folder that holds one, or a run (default: the newest run under outputs/)."""
-    clip: str | None = None
-    """Name or folder of the scene's CLIP, if it is not where the scene file says."""
-
-
 def without(*names: str) -> Callable[[Class], Class]:
     """Return a dataclass decorator that takes inherited settings off the command line."""
+    import tyro
+
     return lambda kind: _marked(_marked(kind, tyro.conf.Fixed, names), tyro.conf.Suppress, names)
 
 
@@ -36,6 +25,8 @@ def showing(*names: str) -> Callable[[Class], Class]:
     def arrange(kind: Class) -> Class:
         if not {"-h", "--help", "--help-all"} & set(sys.argv[1:]):  # tyro would not accept what it hides
             return kind
+        import tyro
+
         own = {field.name: field for field in fields(kind)}
         others = [name for name in own if name not in names]
         arranged = {name: own[name] for name in (*names, *others)}
@@ -48,6 +39,8 @@ def showing(*names: str) -> Callable[[Class], Class]:
 
 def _name_values(kind: type) -> None:
     """Describe the settings that may be absent by their values' kind alone: PATH instead of {None}|PATH."""
+    import tyro
+
     hints = get_type_hints(kind, include_extras=True)
     for name in [field.name for field in fields(kind) if field.default is None]:
         bare = getattr(hints[name], "__origin__", hints[name])  # without Annotated

@@ -24,6 +24,7 @@ from lang3dxl_ns.scene.camera import Camera
 from lang3dxl_ns.scene.record import SceneRecord, overview
 from lang3dxl_ns.things.thing import Thing
 from lang3dxl_ns.training.conversation import Conversation, plain
+from lang3dxl_ns.training.snapshot import Snapshots
 
 if TYPE_CHECKING:
     from nerfstudio.engine.trainer import Trainer
@@ -102,17 +103,16 @@ class AskPanel(ViewerControl):
         self._listed.on_update(lambda event: self._fly_to(event.client))
 
     def _start(self, viewer: Viewer) -> None:
-        self.conversation = Conversation(
+        snapshots = Snapshots(
             self._model.run,
             self._pipeline.scene_file,
             viewer.log_filename.parent,
             viewer.train_lock or nullcontext(),
             learning=lambda: _changes(viewer.trainer),
             learn=self._pipeline.learn_words,
-            shown=self._outputs_shown,
             watch=self._say,
-            drawn=self._drawn,
         )
+        self.conversation = Conversation(snapshots, self._outputs_shown, self._drawn)
         self._asker, self._finder = Worker("ask", self._failed), Worker("find", self._failed)
         self._model.answers = self.conversation
         if self._pipeline.query:

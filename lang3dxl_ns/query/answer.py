@@ -13,11 +13,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.query.answering import Answering, Place
+from lang3dxl_ns.query.answering import Answering
 from lang3dxl_ns.query.match import Found, Match
 from lang3dxl_ns.query.negatives import CLEAR, NOTHING
 from lang3dxl_ns.query.question import Question
 from lang3dxl_ns.query.relevancy import Queries
+from lang3dxl_ns.query.rendered_scene import Place
 from lang3dxl_ns.query.view_ranking import Viewpoint, rank_views, strongest_match
 from lang3dxl_ns.rendering import composite
 from lang3dxl_ns.rendering.gathering import filled_pixels

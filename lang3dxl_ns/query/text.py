@@ -15,7 +15,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.preparation.encoders import load_image_text_encoder
 from lang3dxl_ns.query.doubt import UNRELATED
 from lang3dxl_ns.query.language import meaning, phrases_of, straight
 from lang3dxl_ns.query.negatives import NEGATIVES, competitors
@@ -209,6 +208,8 @@ def text_encoder(file: SceneRecord, device: torch.device | str) -> EncodeTexts:
     """Load the CLIP that a scene's features come from. Raises UserError if it is missing or has changed."""
     if file.clip is None:
         raise UserError(NO_SEMANTICS)
+    from lang3dxl_ns.preparation.encoders import load_image_text_encoder
+
     encoder = load_image_text_encoder(file.clip, device)
     if not same_clip(encoder.identity, file.clip_identity):
         raise UserError(

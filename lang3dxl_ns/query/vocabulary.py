@@ -12,7 +12,6 @@ from typing import Any
 from lang3dxl_ns.common.errors import readable
 from lang3dxl_ns.common.files import read_json
 from lang3dxl_ns.common.presets import load_preset
-from lang3dxl_ns.preparation.encoders import CLIP_OPTION, find_model
 from lang3dxl_ns.query.doubt import UNRELATED
 from lang3dxl_ns.query.language import meaning
 from lang3dxl_ns.query.negatives import NEGATIVES, alternatives, singulars
@@ -89,6 +88,8 @@ def _plural(word: str) -> str:
 def whole_words(clip: str | Path) -> tuple[str, ...]:
     """List the lower-case words of three letters or more that a CLIP's tokenizer has as single tokens. Raises
     UserError if there is no CLIP of this name or folder on this machine."""
+    from lang3dxl_ns.preparation.encoders import CLIP_OPTION, find_model
+
     folder, tokens = find_model(clip, CLIP_OPTION).folder, list[Any]()
     with readable(f"the tokenizer in {folder} can't be read", "download the model again"):
         if (folder / "tokenizer.json").is_file():

@@ -11,7 +11,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-import lang3dxl_ns.rendering.gsplat_build as gsplat_build
 from lang3dxl_ns.common.device import in_full_precision, to_device
 from lang3dxl_ns.common.kernels import takes_kernels
 from lang3dxl_ns.rendering.gaussians import ALPHA_MIN, Ellipses, Gaussians, Raster
@@ -70,6 +69,8 @@ def rasterize(
     if backend == "auto":
         backend = _best_backend(gaussians.means)
     elif backend == "gsplat" and gaussians.means.is_cuda:
+        from lang3dxl_ns.rendering import gsplat_build
+
         gsplat_build.make_ready()
     # gsplat's kernels cannot be launched on empty input.
     by_gsplat = backend == "gsplat" and len(channels) > 0
@@ -92,6 +93,8 @@ def at_fewer_pixels(camera: Camera, height: int, width: int) -> tuple[Camera, fl
 
 def _best_backend(means: Tensor) -> Backend:
     if means.is_cuda:
+        from lang3dxl_ns.rendering import gsplat_build
+
         return "gsplat" if gsplat_build.ready() else "torch"
     return "numba" if takes_kernels(means) else "torch"
 

@@ -19,7 +19,6 @@ from PIL import ExifTags
 
 from lang3dxl_ns.common.checks import expect, is_coordinate
 from lang3dxl_ns.common.pictures import NoPictureError, open_picture
-from lang3dxl_ns.scene.colmap import load_pycolmap
 from lang3dxl_ns.scene.frame import turned_to
 
 LEAST_PHOTOS = 3
@@ -130,6 +129,8 @@ def georeference(
 def local_meters(positions: Iterable[tuple[float, float, float]]) -> Float64[Array, "n 3"]:
     """Convert latitudes and longitudes in degrees and altitudes in meters (WGS 84) to meters east, north and
     up of their median."""
+    from lang3dxl_ns.scene.colmap import load_pycolmap
+
     degrees = np.array(list(positions), dtype=np.float64)
     middle = np.median(degrees, axis=0)
     if np.ptp(degrees[:, 1]) > 180:  # on both sides of the date line

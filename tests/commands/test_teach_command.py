@@ -37,7 +37,7 @@ DOME = "61,61,77,77"
 @pytest.fixture
 def place(tmp_path, monkeypatch):
     """A scene file, whose CLIP is the painted one."""
-    monkeypatch.setattr("lang3dxl_ns.query.scene.text_encoder", lambda file, device: encode_texts)
+    monkeypatch.setattr("lang3dxl_ns.query.answering.text_encoder", lambda file, device: encode_texts)
     decoder = LiftedFeatures(CHANNELS, 0)
     decoder.name = "lifting"
     painted = painted_scene()

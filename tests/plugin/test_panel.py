@@ -22,7 +22,8 @@ from lang3dxl_ns.query.question import QueryConfig
 from lang3dxl_ns.scene.record import overview
 from lang3dxl_ns.things.find import Things
 from lang3dxl_ns.things.thing import Sighting, Thing
-from lang3dxl_ns.training import conversation as session
+from lang3dxl_ns.training import snapshot as session
+from lang3dxl_ns.training.conversation import Conversation
 
 
 @pytest.fixture(scope="module")
@@ -222,18 +223,18 @@ def test_while_the_model_learns_its_words_are_gathered_when_they_are_asked_for(t
         learned.append(model.run.step)
         model.gauss_params["codes"] = codes
 
-    conversation = session.Conversation(
+    snapshots = session.Snapshots(
         model.run,
         trainer.pipeline.scene_file,
         trainer.base_dir,
         trainer.train_lock,
         learning=lambda: True,
         learn=learn,
-        shown=lambda: {"rgb"},
         watch=lambda _: None,
     )
+    conversation = Conversation(snapshots, lambda: {"rgb"})
     conversation.ask("dome")
-    before = conversation._scene
+    before = snapshots.latest().scene
     assert learned == [model.run.step] and "still learns" in conversation.status()
     assert conversation.find()[0].views
     conversation.ask("dome")
@@ -241,7 +242,7 @@ def test_while_the_model_learns_its_words_are_gathered_when_they_are_asked_for(t
     model.run.step += 10
     conversation.ask("dome")
     assert len(learned) == 2
-    assert conversation._scene is not before and conversation._scene.cache is None
+    assert snapshots.latest().scene is not before and snapshots.latest().scene.cache is None
     assert model.training
     assert trainer.train_lock.acquire(blocking=False)
     trainer.train_lock.release()

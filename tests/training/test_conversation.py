@@ -7,7 +7,7 @@ import pytest
 import torch
 from painted_scene import COUNT, encode_texts, painted_codes, painted_scene, painted_splats
 
-from lang3dxl_ns.training import conversation as module
+from lang3dxl_ns.training import snapshot as module
 from lang3dxl_ns.training.conversation import Conversation
 
 
@@ -30,9 +30,9 @@ def talk(model, monkeypatch, tmp_path):
     monkeypatch.setattr(module, "text_encoder", lambda *_: encode_texts)
     monkeypatch.setattr(module, "snapshot", model.scene)
     monkeypatch.setattr(module, "forget_words", lambda _: None)
-    nothing = {"learn": lambda: None, "shown": set, "watch": lambda _: None}
+    nothing = {"learn": lambda: None, "watch": lambda _: None}
     learning = lambda: model.training  # noqa: E731
-    return Conversation(model, None, tmp_path, nullcontext(), learning, **nothing)
+    return Conversation(module.Snapshots(model, None, tmp_path, nullcontext(), learning, **nothing), set)
 
 
 def frame(talk, model, between=lambda: None):
@@ -83,13 +83,13 @@ def test_a_question_that_waited_while_the_final_words_were_learned_keeps_them(ta
     told = []
     model.learns_words_at_the_end = True
     monkeypatch.setattr(module, "forget_words", lambda _: told.append("forgotten"))
-    talk.learn = lambda: told.append("learned")
+    talk.snapshots.learn = lambda: told.append("learned")
 
     @contextmanager
     def training_ends():
         model.training = False
         yield
 
-    talk.lock = training_ends()
+    talk.snapshots.lock = training_ends()
     talk.ask("dome")
-    assert told == [] and talk._scene_step is None
+    assert told == [] and talk.snapshots.latest().step is None

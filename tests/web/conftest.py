@@ -59,7 +59,7 @@ def page(desk):
 @pytest.fixture
 def file(tmp_path, monkeypatch):
     """A scene file, whose CLIP is the painted one."""
-    monkeypatch.setattr("lang3dxl_ns.query.scene.text_encoder", lambda file, device: encode_texts)
+    monkeypatch.setattr("lang3dxl_ns.query.answering.text_encoder", lambda file, device: encode_texts)
     decoder, painted = LiftedFeatures(CHANNELS, 0), painted_scene()
     decoder.name = "lifting"
     codes = torch.cat([torch.nan_to_num(painted.codes), torch.ones(len(painted.codes), 1)], 1)
