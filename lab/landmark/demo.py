@@ -188,7 +188,7 @@ class Demo:
         settings = tyro.cli(Train, args=words, default=usual).settings()
         if self.quick:
             settings.scene.decoder.compression.steps = 300
-        settings.resolve()
+        settings = settings.resolved()
         return settings
 
     def _report(self, splits: dict[str, list[EvaluatedPhoto]], scene: Scene) -> dict[str, Any]:

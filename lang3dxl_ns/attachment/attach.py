@@ -11,7 +11,7 @@ import torch
 from lang3dxl_ns.attachment import AttachConfig
 from lang3dxl_ns.attachment.frames import find_frame, side_by_side
 from lang3dxl_ns.attachment.known_frames import Similarity
-from lang3dxl_ns.attachment.learn import learn, photos_of, scene_file, settled
+from lang3dxl_ns.attachment.learn import learn, photos_of, scene_file
 from lang3dxl_ns.attachment.segment import segmented
 from lang3dxl_ns.attachment.views import rendered_views
 from lang3dxl_ns.common.console import say, some
@@ -30,6 +30,7 @@ from lang3dxl_ns.rendering import Splats
 from lang3dxl_ns.scene.capture import Capture, open_capture
 from lang3dxl_ns.scene.companions import cache_folder
 from lang3dxl_ns.scene.photo_folder import check_data
+from lang3dxl_ns.training.batches import settled
 
 _SMALLEST = 1e-3
 """Size of a splat in its units, below which it lies before the near plane of every camera that shows it."""
@@ -70,7 +71,7 @@ def attach(
     worker = known_device(device)
     with stages.stage("splat"):  # a damaged one is refused before any model is downloaded
         splats = _read(path).to(worker)
-    preparation = settled(config)
+    preparation = settled(config, learned=False, gathered=True)
     check_encoders(preparation.clip, preparation.dense)
     found = find_text_segmenter(preparation.foreground_model, preparation.sam) if config.segment else None
     with stages.stage("frame"):

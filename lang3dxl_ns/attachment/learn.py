@@ -20,18 +20,11 @@ from lang3dxl_ns.rendering import Splats
 from lang3dxl_ns.scene.capture import Capture, Split
 from lang3dxl_ns.scene.frame import Frame
 from lang3dxl_ns.scene.record import SceneRecord
-from lang3dxl_ns.training.batches import TrainingData, settle
+from lang3dxl_ns.training.batches import TrainingData
 from lang3dxl_ns.training.learn_codes import learn_codes, target_view
 
 LONGER_SIDE = 800
 """Largest longer side at which photos are gathered, pixels. A fine crop covers dozens of pixels."""
-
-
-def settled(config: PreparationConfig) -> PreparationConfig:
-    """Return the settings for gathering features: fine crops, the CLIP at hand, and its dense encoder."""
-    config = replace(config, crops="fine")
-    settle(config, learned=False, gathered=True)
-    return config
 
 
 def photos_of(

@@ -96,16 +96,16 @@ class Needs(PreparationConfig, CaptureSettings):
 
 
 def _opened(settings: Prepare | Needs, data: Path) -> TrainingData:
-    """Open a folder of photos with these settings, which are resolved. Nothing is prepared yet."""
+    """Open a folder of photos with these settings. Nothing is prepared yet."""
     from lang3dxl_ns.common.device import best_device
     from lang3dxl_ns.scene.capture import open_capture, say_left_out
     from lang3dxl_ns.scene.companions import cache_folder
-    from lang3dxl_ns.training.batches import TrainingData, settle
+    from lang3dxl_ns.training.batches import TrainingData, settled
 
     settings.check()
     capture = open_capture(data, settings, settings.cache_dir)
     say_left_out(capture)
     learned = settings.crops == "pyramid" or settings.regions not in ("auto", "none")
-    settle(settings, learned, gathered=not learned)
+    targets = settled(settings, learned, gathered=not learned)
     cache = cache_folder(capture.folder, settings.cache_dir)
-    return TrainingData(capture, settings, cache, best_device(), learned)
+    return TrainingData(capture, targets, cache, best_device(), learned)

@@ -40,8 +40,7 @@ def load_run(
     if not isinstance(settings, Lang3DXLModelConfig):
         raise UserError(f"{folder} is a run of another method: train one with ns-train lang3dxl")
     # The checkpoint brings its own Gaussians, so start with as few as possible.
-    start = replace(settings, sky_gaussians=0, random_init=False)  # type: ignore[call-arg]
-    start.fit_to_run(start.total_steps)
+    start = replace(settings, sky_gaussians=0, random_init=False).fitted(settings.total_steps)  # type: ignore[call-arg]
     facts = SceneFacts(file.trained)
     model = Training.begin(start, facts, (torch.eye(4)[:, :3], torch.zeros(4, 3)))
     with readable(f"the checkpoint {path} does not fit the config.yml beside it", "copy both from one run"):

@@ -92,7 +92,7 @@ class Lang3DXLModel(SplatfactoModel):
 
     def populate_modules(self) -> None:
         """Build Gaussians, strategy, components and metrics (on the CPU; the pipeline moves them)."""
-        self.config.fit_to_run(self.config.total_steps)
+        self.config = self.config.fitted(self.config.total_steps)
         facts = self.kwargs["metadata"].get(FACTS) or SceneFacts()
         self.run = Training.begin(self.config, facts, self.seed_points)
         self.gauss_params = self.run.gaussians

@@ -29,7 +29,7 @@ from lang3dxl_ns.preparation.model_files import BUILTIN, check_encoders
 from lang3dxl_ns.preparation.needs import read_needs
 from lang3dxl_ns.scene.photo_folder import check_data
 from lang3dxl_ns.scene.record import SCENE_FILE
-from lang3dxl_ns.training.batches import settle
+from lang3dxl_ns.training.batches import settled
 from lang3dxl_ns.training.estimate import check_device
 
 
@@ -125,20 +125,20 @@ class Lang3DXLTrainerConfig(RunConfig):
         iterations = self.max_num_iterations
         for group in self.optimizers.values():
             if isinstance(group["optimizer"], RunAdamConfig):
-                group["optimizer"].fit(iterations)
+                group["optimizer"] = group["optimizer"].fitted(iterations)
             if isinstance(group["scheduler"], RunScheduleConfig):
-                group["scheduler"].total_steps = iterations
+                group["scheduler"] = replace(group["scheduler"], total_steps=iterations)
         self.load_dir, self.load_checkpoint = _absolute(self.load_dir), _absolute(self.load_checkpoint)
         if self.load_dir is not None:
             self._follow(self.load_dir.parent)
         elif self.load_checkpoint is not None:
             self._follow(self.load_checkpoint.parents[1])
-        self.pipeline.model.fit_to_run(iterations)
+        self.pipeline.model = self.pipeline.model.fitted(iterations)
         self.steps_per_save = min(self.steps_per_save, max(iterations // 4, 1))
-        datamanager = self.pipeline.datamanager
         learned = self.pipeline.model.decoder.learns_from_renderings
-        datamanager.targets_in_steps = learned
-        settle(datamanager, learned, not learned or self.pipeline.model.codes_from == "photos")
+        gathered = not learned or self.pipeline.model.codes_from == "photos"
+        datamanager = replace(settled(self.pipeline.datamanager, learned, gathered), targets_in_steps=learned)
+        self.pipeline.datamanager = datamanager
         for name in ("clip", "dense", "sam", "foreground_model"):
             choice = getattr(datamanager, name)
             if choice not in (BUILTIN, "none", "auto") and expanded(choice).is_dir():

@@ -69,7 +69,7 @@ def rasterize(
     if backend == "auto":
         backend = _best_backend(gaussians.means)
     elif backend == "gsplat" and gaussians.means.is_cuda:
-        from lang3dxl_ns.rendering import gsplat_build
+        import lang3dxl_ns.rendering.gsplat_build as gsplat_build
 
         gsplat_build.make_ready()
     # gsplat's kernels cannot be launched on empty input.
@@ -93,7 +93,7 @@ def at_fewer_pixels(camera: Camera, height: int, width: int) -> tuple[Camera, fl
 
 def _best_backend(means: Tensor) -> Backend:
     if means.is_cuda:
-        from lang3dxl_ns.rendering import gsplat_build
+        import lang3dxl_ns.rendering.gsplat_build as gsplat_build
 
         return "gsplat" if gsplat_build.ready() else "torch"
     return "numba" if takes_kernels(means) else "torch"

@@ -210,11 +210,13 @@ def open_capture(
 def find_source(
     data: str | Path, settings: CaptureSettings, cache_dir: Path | None = None, may_reconstruct: bool = True
 ) -> tuple[Path, Path]:
-    """Find a capture's folder and its COLMAP model or transforms.json, or make a model. Raises UserError as
-    `open_capture` does."""
-    folder = expanded(data).absolute()
-    if is_video(folder) or (not folder.exists() and frames_folder(folder).is_dir()):
-        folder = extract_frames(folder) if may_reconstruct else frames_folder(folder)
+    """Find a capture's folder and the COLMAP model or transforms.json with its cameras, or make a model.
+
+    The first of these counts: the transforms.json that is `data`; the model that the settings name; a model,
+    earlier reconstruction or transforms.json in the folder, or in the scene that the folder is a part of.
+    Raises UserError as `open_capture` does.
+    """
+    folder = _with_frames(expanded(data).absolute(), may_reconstruct)
     if folder.suffix == ".json" and folder.is_file():
         return folder.parent, folder
     check_data(folder)
@@ -222,24 +224,33 @@ def find_source(
         return folder, folder / settings.colmap_path
     if (whole := whole_scene(folder)) != folder:
         say(f"{folder} is a part of the scene {whole}, which is read")
-        folder, source = whole, folder
-        return folder, source if has_model(source) else find_model(folder) or source
-    work = None if cache_dir is None else expanded(cache_dir).absolute() / "reconstruction"
-    own = [folder / _OWN_MODEL]
-    if work is not None and shows_these(work, folder):
-        own.append(work / "sparse/0")
-    for model in (find_model(folder), *filter(has_model, own)):
-        if model is not None:
-            return folder, model
-    for name in (TRANSFORMS, SPLITS[0]):
-        if (folder / name).exists():
-            return folder, folder / name
+        return whole, folder if has_model(folder) else find_model(whole) or folder
+    if (source := _source_in(folder, cache_dir)) is not None:
+        return folder, source
     if may_reconstruct and find_photos(folder).names:
         mention_other_cameras(folder)
         return reconstruct_scene(folder, cache_dir)
     if may_reconstruct and not any(folder.iterdir()):
         raise UserError(f"{folder} is empty: give the folder with your photos")
     return folder, folder / MODEL_FOLDERS[0]  # reading it tells what is missing
+
+
+def _with_frames(data: Path, may_extract: bool) -> Path:
+    """Return the folder of a video's frames, also of one that is gone; any other path as it is."""
+    if not is_video(data) and (data.exists() or not frames_folder(data).is_dir()):
+        return data
+    return extract_frames(data) if may_extract else frames_folder(data)
+
+
+def _source_in(folder: Path, cache_dir: Path | None) -> Path | None:
+    """Find a model in a folder, one that was reconstructed from it before, or a transforms.json."""
+    reconstructed = [folder / _OWN_MODEL]
+    if cache_dir is not None:
+        work = expanded(cache_dir).absolute() / "reconstruction"
+        reconstructed += [work / "sparse/0"] if shows_these(work, folder) else []
+    transforms = [folder / name for name in (TRANSFORMS, SPLITS[0])]
+    found = [*filter(has_model, reconstructed), *filter(Path.exists, transforms)]
+    return find_model(folder) or next(iter(found), None)
 
 
 # ── from a COLMAP model ─────────────────────────────────────────────────────────────────────────────────

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import random
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Any, Literal, TypeVar, cast
 
 import torch
 from torch import Tensor
@@ -35,21 +35,24 @@ from lang3dxl_ns.scene.reconstruction import doubtful_photos
 from lang3dxl_ns.scene.record import ScenePhoto, SceneRecord
 from lang3dxl_ns.training.state import PhotoCamera, Training
 
+Prepared = TypeVar("Prepared", bound=PreparationConfig)
 IN_A_STEP = {"clip_target": torch.float32, "dense_target": torch.float32, "regions": torch.int64}
 """Number types of targets in a step; in memory they are kept half as wide."""
 MOST_GONE = 0.1
 """Share of the training photos that may vanish before training ends."""
 
 
-def settle(config: PreparationConfig, learned: bool, gathered: bool) -> None:
-    """Resolve what is prepared, in place: semantics `learned` with the scene use regions in every step;
-    features `gathered` onto Gaussians, also those that codes start from, need fine crops."""
-    config.clip = usual_clip(config.clip)
-    if config.crops == "auto":
-        config.crops = "fine" if gathered else "pyramid"
+def settled(config: Prepared, learned: bool, gathered: bool) -> Prepared:
+    """Return the settings of the targets without `auto`: semantics `learned` with the scene use regions in
+    every step; features `gathered` onto Gaussians, also those that codes start from, need fine crops."""
+    config = replace(config, clip=usual_clip(config.clip))
+    crops, regions = config.crops, config.regions
+    if crops == "auto":
+        crops = "fine" if gathered else "pyramid"
     if not learned or config.clip == "none":
-        config.regions = "none"
-    config.dense = "none" if config.clip == "none" else usual_dense(config, learned)
+        regions = "none"
+    dense = "none" if config.clip == "none" else usual_dense(config, learned)
+    return replace(config, crops=crops, regions=regions, dense=dense)
 
 
 def read_data(

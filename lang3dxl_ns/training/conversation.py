@@ -45,7 +45,7 @@ class Conversation:
     """Duration of the latest frame in seconds, matches included."""
     _asked: Asked | None = None
     """The latest question. It is replaced as a whole, because other threads read it."""
-    _drawn: Asked | None = None
+    _of_frame: Asked | None = None
     """The question of the frame being drawn."""
 
     # ── asking ──────────────────────────────────────────────────────────────────────────────────────
@@ -90,17 +90,17 @@ class Conversation:
     def channels(self) -> Tensor | None:
         """Return the values that Gaussians carry in the next rendering; None if the question was asked in
         training, since they may then not be the snapshot's."""
-        self._drawn = self._asked
-        if self._drawn is None or self._drawn.snapshot.step is not None:
+        self._of_frame = self._asked
+        if self._of_frame is None or self._of_frame.snapshot.step is not None:
             return None
-        return self._drawn.question.channels
+        return self._of_frame.question.channels
 
     def outputs(self, rendering: Rendering, seconds: float) -> dict[str, Tensor]:
         """Return `overlay` and the relevancies of a rendering that took `seconds`, for the question at the
         preceding call of `channels`. `overlay` is always present, since viewers break without it."""
         start, question = time.perf_counter(), None
-        if self._drawn is not None:
-            (scene, _), question = self._drawn
+        if self._of_frame is not None:
+            (scene, _), question = self._of_frame
             if rendering.channels is None:
                 of_snapshot = scene.draw(rendering.camera, question.channels)
                 rendering = replace(rendering, channels=of_snapshot.channels, alpha=of_snapshot.alpha)

@@ -60,7 +60,7 @@ class Densification:
     def of(settings: TrainingSettings) -> Densification:
         """Build the densification of a run whose settings are fitted to its length."""
         steps = settings.total_steps
-        assert settings.densify_grad_thresh is not None  # set by `fit_to_run`
+        assert settings.densify_grad_thresh is not None  # set by `fitted`
         return Densification(
             start=round(settings.densify_from * steps),
             stop=round(settings.densify_until * steps),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import threading
 import warnings
-from dataclasses import dataclass, field, fields, is_dataclass
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, get_type_hints
@@ -31,11 +31,11 @@ from lang3dxl_ns.scene.capture import Capture, open_capture, say_left_out
 from lang3dxl_ns.scene.capture_settings import CaptureSettings
 from lang3dxl_ns.scene.companions import cache_folder
 from lang3dxl_ns.scene.photo_folder import check_data
-from lang3dxl_ns.training.batches import TrainingData, settle
+from lang3dxl_ns.training.batches import TrainingData, settled
 from lang3dxl_ns.training.checkpoint import CHECKPOINT, as_damage, read_checkpoint, save_checkpoint
 from lang3dxl_ns.training.estimate import check_device, estimate
 from lang3dxl_ns.training.learn_codes import begin_codes, forget_words, learn_words
-from lang3dxl_ns.training.learning_rates import Rates, learning_rates, printed_learning_rates
+from lang3dxl_ns.training.learning_rates import Rates, fitted_rates, learning_rates, printed_learning_rates
 from lang3dxl_ns.training.memory import out_of_memory, plan
 from lang3dxl_ns.training.scene_settings import PRINTED_PHOTO_SCALE, Method, RunSettings
 from lang3dxl_ns.training.settings import TrainingSettings, as_printed, without_effect
@@ -110,8 +110,8 @@ class Settings(RunSettings):
         setattr(owner, attribute, value)
 
     def check_effect(self) -> None:
-        """Raise UserError for a setting that has no effect with this method. Call this before `resolve`,
-        which changes settings."""
+        """Raise UserError for a setting that has no effect with this method. Call this before `resolved`,
+        which fills settings in."""
         of_scene, of_targets = without_effect(self.scene, self.targets)
         if changed := [*of_scene, *of_targets]:
             raise UserError(
@@ -119,19 +119,15 @@ class Settings(RunSettings):
                 "training: leave it off, or train with --method lang3dxl-paper"
             )
 
-    def resolve(self) -> None:
-        """Check all settings, and resolve what depends on the length of the run, in place. Raises UserError
-        for a setting that is out of its range."""
+    def resolved(self) -> Settings:
+        """Check all settings, and return them with the values that depend on the length of the run. Raises
+        UserError for a setting that is out of its range."""
         check_numbers(self, _BOUNDS)
         self.scene.check()
         self.targets.check()
-        self.scene.fit_to_run(self.steps)
-        for rate, schedule in self.rates.values():
-            rate.fit(self.steps)
-            if schedule is not None:
-                schedule.total_steps = self.steps
-        learned = self.scene.decoder.learns_from_renderings
-        settle(self.targets, learned, not learned or self.scene.codes_from == "photos")
+        scene, learned = self.scene.fitted(self.steps), self.scene.decoder.learns_from_renderings
+        targets = settled(self.targets, learned, not learned or scene.codes_from == "photos")
+        return replace(self, scene=scene, targets=targets, rates=fitted_rates(self.rates, self.steps))
 
 
 class Run:
@@ -298,7 +294,7 @@ def begin(capture: Capture, settings: Settings, out: Path, cache_dir: Path, devi
     """Prepare a run, or the continuation of the folder's; see `fit`."""
     # A group without gradients so far has a schedule all the same.
     warnings.filterwarnings("ignore", "Detected call of .lr_scheduler.step")
-    settings.resolve()
+    settings = settings.resolved()
     device = device or best_device()
     check_device(device, settings.scene.rasterizer)
     if settings.mixed_precision and not (device.startswith("cuda") and torch.cuda.is_bf16_supported(False)):
@@ -315,7 +311,7 @@ def fit(capture: Capture, settings: Settings, out: Path, cache_dir: Path, device
 
     Args:
         capture: photos with cameras and points.
-        settings: settings of the run, which are resolved in place.
+        settings: settings of the run.
         out: folder of the run; it gets NAME.scene, also at every checkpoint, and the checkpoint.
         cache_dir: folder of prepared targets.
         device: by default a GPU if there is one.
@@ -336,7 +332,7 @@ def run_folder(
     """Open the capture in a folder, and train it as `fit`; return the folder of the run, by default
     outputs/NAME, and the scene. `restart` forgets the folder's run. Raises as `fit`."""
     check_data(expanded(data))
-    settings.resolve()
+    settings = settings.resolved()
     check_encoders(settings.targets.clip, settings.targets.dense)
     capture = open_capture(data, settings.capture, settings.targets.cache_dir)
     say_left_out(capture)

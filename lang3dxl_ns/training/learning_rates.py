@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
-from typing import Literal
+from typing import Literal, TypeVar
 
 import torch
 from torch import Tensor
@@ -52,6 +52,9 @@ def _fraction(x: float) -> float:
     return min(max(float(x), 0.0), 1.0)
 
 
+Fitted = TypeVar("Fitted", bound="Rate")
+
+
 @dataclass
 class Rate:
     """Settings of Adam with a learning rate for the length of the run."""
@@ -66,11 +69,12 @@ class Rate:
     """Rate for runs of up to 1,000 iterations, where `lr` is for 30,000 and more; in between, the two are
     interpolated on a logarithmic scale. None: the same as `lr`."""
 
-    def fit(self, iterations: int) -> None:
-        """Resolve `lr` for a run of this many iterations."""
-        if self.short_lr is not None:
-            self.lr = log_linear(run_length_weight(iterations), self.short_lr, self.lr)
-            self.short_lr = None
+    def fitted(self: Fitted, iterations: int) -> Fitted:
+        """Return these settings with `lr` for a run of this many iterations."""
+        if self.short_lr is None:
+            return self
+        rate = log_linear(run_length_weight(iterations), self.short_lr, self.lr)
+        return replace(self, lr=rate, short_lr=None)
 
     def adam(self, parameters: Iterable[Tensor]) -> Adam:
         """Build Adam for these parameters."""
@@ -118,6 +122,14 @@ class Schedule:
 
 Rates = Mapping[str, tuple[Rate, Schedule | None]]
 """Rate and schedule of each parameter group."""
+
+
+def fitted_rates(rates: Rates, iterations: int) -> Rates:
+    """Return the rates and schedules for a run of this many iterations."""
+    return {
+        name: (rate.fitted(iterations), schedule and replace(schedule, total_steps=iterations))
+        for name, (rate, schedule) in rates.items()
+    }
 
 
 def learning_rates() -> dict[str, tuple[Rate, Schedule | None]]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from operator import attrgetter
+from typing import Literal, TypeVar
 
 from lang3dxl_ns.common.checks import check_numbers
 from lang3dxl_ns.common.console import say
@@ -13,11 +14,12 @@ from lang3dxl_ns.components.appearance import AppearanceConfig
 from lang3dxl_ns.components.decoders import DecoderConfig
 from lang3dxl_ns.components.downsampler import DownsamplerConfig
 from lang3dxl_ns.components.feature_decoder import LearningDecoder
-from lang3dxl_ns.components.field_settings import Preset, SemanticFieldConfig
+from lang3dxl_ns.components.field_settings import SemanticFieldConfig
 from lang3dxl_ns.preparation.settings import PreparationConfig
 from lang3dxl_ns.training.learning_rates import log_linear, run_length_weight
 from lang3dxl_ns.training.scene_settings import PRINTED_LOOKS, SceneSettings, plain_as_printed
 
+Fitted = TypeVar("Fitted", bound="TrainingSettings")
 SHORT_FIELD_RUN = 5_000
 """Iterations below which a run that trains the field with the scene uses its `short` preset, since the
 published grid has learned no words after 300. `auto` of `codes_from` and of the looks' grid use this too."""
@@ -84,41 +86,49 @@ class TrainingSettings(SceneSettings):
                 f"{model_option('decode-size')} is {smallest} {largest}: give a range in 1 to 4096"
             )
 
-    def fit_to_run(self, iterations: int) -> None:
-        """Resolve settings that depend on the length of the run. Numbers change gradually between short and
-        long runs (`optimizers.run_length_weight`)."""
-        x = run_length_weight(iterations)
-        self.total_steps = iterations
-        if self.semantic_field.preset == "auto":
+    def fitted(self: Fitted, iterations: int) -> Fitted:
+        """Return these settings for a run of this length: every `auto` and None that depends on it has its
+        value. Numbers change gradually between short and long runs (`learning_rates.run_length_weight`)."""
+        x, short = run_length_weight(iterations), iterations < SHORT_FIELD_RUN
+        field_preset, looks_preset = self.semantic_field.preset, self.appearance.preset
+        if field_preset == "auto":
             # Compression is a direct regression and does not depend on the run's length.
-            compressed = self.decoder.name == "gathered"
-            preset: Preset = "short" if compressed or iterations < SHORT_FIELD_RUN else "paper"
-            self.semantic_field = replace(self.semantic_field, preset=preset)
+            field_preset = "short" if short or self.decoder.name == "gathered" else "paper"
             if self.decoder.name == "paper":
                 say(
-                    f"Semantic field: preset {preset} (short in runs of under {SHORT_FIELD_RUN:,} "
+                    f"Semantic field: preset {field_preset} (short in runs of under {SHORT_FIELD_RUN:,} "
                     "iterations, paper, as printed, in longer ones)"
                 )
+        if looks_preset == "auto":
+            looks_preset = "coarse" if short else "paper"
+        semantic_field = replace(self.semantic_field, preset=field_preset)
+        semantic_field.resolved()  # a combination that is impossible is told before the work
+        codes_from = self._codes_from(short)
+        start_of_codes = START_OF_CODES if codes_from == "photos" else 0.0
+        threshold, weight, sizes = self.densify_grad_thresh, self.dense_weight, self.decode_size
+        return replace(
+            self,
+            total_steps=iterations,
+            semantic_field=semantic_field,
+            appearance=replace(self.appearance, preset=looks_preset),
+            downsampler=self.downsampler.resolved(field_preset),
+            codes_from=codes_from,
+            warm_up=self.warm_up or start_of_codes,
+            densify_grad_thresh=log_linear(x, 2e-3, 2e-4) if threshold is None else threshold,
+            dense_weight=log_linear(x, 2.0, 0.5) if weight is None else weight,
+            decode_size=(round(56 + 24 * x), round(72 + 48 * x)) if sizes is None else sizes,
+        )
+
+    def _codes_from(self, short: bool) -> Literal["noise", "photos"]:
         learns = issubclass(self.decoder.kind, LearningDecoder)
         if self.codes_from == "auto":
-            self.codes_from = "photos" if learns and iterations < SHORT_FIELD_RUN else "noise"
+            return "photos" if learns and short else "noise"
         if self.codes_from == "photos" and not learns:
             raise UserError(
                 f"codes of the decoder {self.decoder.name} can't start from photos: leave "
                 f"{model_option('codes-from')} off"
             )
-        if self.codes_from == "photos" and not self.warm_up:
-            self.warm_up = START_OF_CODES
-        if self.appearance.preset == "auto":
-            self.appearance.preset = "coarse" if iterations < SHORT_FIELD_RUN else "paper"
-        self.semantic_field.resolved()  # a combination that is impossible is told before the work
-        self.downsampler = self.downsampler.resolved(self.semantic_field.preset)
-        if self.densify_grad_thresh is None:
-            self.densify_grad_thresh = log_linear(x, 2e-3, 2e-4)
-        if self.dense_weight is None:
-            self.dense_weight = log_linear(x, 2.0, 0.5)
-        if self.decode_size is None:
-            self.decode_size = (round(56 + 24 * x), round(72 + 48 * x))
+        return self.codes_from
 
 
 def as_printed(settings: TrainingSettings, targets: PreparationConfig) -> None:
@@ -138,7 +148,7 @@ _OF_RENDERINGS = (
 
 def without_effect(scene: TrainingSettings, targets: PreparationConfig) -> tuple[list[str], list[str]]:
     """List the settings, of the scene and of the targets, that differ from their defaults although they have
-    no effect in this run. Call this before `fit_to_run`, which changes them."""
+    no effect in this run. Call this before `fitted`, which fills them in."""
     if scene.decoder.learns_from_renderings:
         return [], []
     usual, regions = TrainingSettings(), targets.regions not in ("auto", "none")

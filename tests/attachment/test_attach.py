@@ -14,7 +14,7 @@ from lang3dxl_ns.attachment import AttachConfig
 from lang3dxl_ns.attachment.attach import attach
 from lang3dxl_ns.attachment.frames import camera_in
 from lang3dxl_ns.attachment.known_frames import known_frames
-from lang3dxl_ns.attachment.learn import photos_of, scene_file, settled
+from lang3dxl_ns.attachment.learn import photos_of, scene_file
 from lang3dxl_ns.commands.attach import Attach, _show
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.components.field_settings import CompressionConfig
@@ -23,6 +23,7 @@ from lang3dxl_ns.files.scene_file import read_scene
 from lang3dxl_ns.files.scene_file import write_scene as write_scene_file
 from lang3dxl_ns.files.splat_file import write_splats
 from lang3dxl_ns.scene.capture import open_capture
+from lang3dxl_ns.training.batches import settled
 from lang3dxl_ns.words.taught_words import Example
 
 SETTINGS = AttachConfig(views=4, up="z", clip="builtin", dense="builtin", dense_tokens=16)
@@ -215,7 +216,7 @@ def test_settings_that_attaching_does_not_read_and_impossible_words_are_told_bef
 
 def test_large_photos_are_prepared_at_the_requested_size(tmp_path):
     write_scene(tmp_path / "photos", size=(320, 240), photos=3, points=200, coarseness=4)
-    config = settled(replace(SETTINGS, longer_side=120))
+    config = settled(replace(SETTINGS, longer_side=120), learned=False, gathered=True)
     capture = open_capture(tmp_path / "photos")
     data = photos_of(capture, np.eye(4), config, tmp_path / "cache", "cpu")
     targets = data.targets
@@ -233,7 +234,9 @@ def test_a_damaged_photo_is_left_out_of_the_scene_and_others_are_listed_as_they_
     damaged.path.write_bytes(damaged.path.read_bytes()[:900])
     monkeypatch.setattr("lang3dxl_ns.attachment.learn.LONGER_SIDE", 80)
     whole = np.diag([2.0, 2.0, 2.0, 1.0])
-    data = photos_of(capture, whole, settled(SETTINGS), tmp_path / "cache", "cpu")
+    data = photos_of(
+        capture, whole, settled(SETTINGS, learned=False, gathered=True), tmp_path / "cache", "cpu"
+    )
     record = scene_file(data)
     assert [photo.name for photo in record.photos] == [photo.name for photo in others]
     assert {(photo.camera.width, photo.camera.height) for photo in record.photos} == {(80, 60)}

@@ -65,3 +65,14 @@ def test_without_a_name_the_scenes_are_listed(capsys):
     cli.main(["preset"])
     assert capsys.readouterr().out.split() == ["official", *scene_presets()]
     assert all(train_flags(name) for name in scene_presets())
+
+
+def test_lang3dxl_train_takes_the_flags_of_scenes_that_it_has_all_settings_of(capsys):
+    for scene in ("milano", "st_paul"):
+        cli.main(["preset", f"holyscenes/{scene}", "--command", "train"])
+        given = cli._parsed(["train", "photos", *capsys.readouterr().out.split()])
+        assert (given.method, given.steps) == ("lang3dxl-paper", 70_000)
+        assert given.scale_preset == f"holyscenes/{scene}"
+    for name in ("official", "holyscenes/badshahi"):
+        with pytest.raises(SystemExit, match="has no .*: leave --command off, and use ns-train"):
+            cli.main(["preset", name, "--command", "train"])

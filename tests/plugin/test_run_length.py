@@ -33,9 +33,9 @@ def test_schedules_leave_plain_floats_in_the_checkpoint():
 )
 def test_rates_go_from_those_of_short_runs_to_those_of_long_ones(iterations, rate):
     config = RunAdamConfig(lr=1e-4, short_lr=1e-2)
-    config.fit(iterations)
+    config = config.fitted(iterations)
     assert config.lr == pytest.approx(rate)
-    config.fit(LONG_RUN)  # resolved once: a config read from disk stays as trained
+    config = config.fitted(LONG_RUN)  # resolved once: a config read from disk stays as trained
     assert config.lr == pytest.approx(rate)
 
 

@@ -13,7 +13,7 @@ from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.preparation.encoders import load_dense_encoder, load_image_text_encoder
 from lang3dxl_ns.preparation.model_files import USUAL_CLIP, check_encoders, find_model, usual_clip
 from lang3dxl_ns.preparation.settings import PreparationConfig
-from lang3dxl_ns.training.batches import settle
+from lang3dxl_ns.training.batches import settled
 
 TEXTS = ["a rose window", "minaret", "the dome of a mosque, seen from far away in the evening light"]
 
@@ -220,8 +220,7 @@ def test_half_precision_on_the_gpu_stays_close_to_the_cpu(clip_folder, dino_fold
 )
 def test_the_built_in_clip_takes_the_built_in_dense_encoder_along(clip, dense, learned, expected):
     config = PreparationConfig(clip=clip, dense=dense)
-    settle(config, learned, not learned)
-    assert config.dense == expected
+    assert settled(config, learned, not learned).dense == expected
 
 
 CLIP, DINO = "openai/clip-vit-base-patch32", "facebook/dinov2-small"
