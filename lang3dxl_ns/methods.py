@@ -46,20 +46,15 @@ def _config(method: str, iterations: int, rates: Rates) -> Lang3DXLTrainerConfig
     )
 
 
-def _paper_config() -> Lang3DXLTrainerConfig:
-    """Build the configuration of Lang3D-XL as printed; see `as_printed`."""
-    config = _config("lang3dxl-paper", 70_000, printed_learning_rates())
-    as_printed(config.pipeline.model, config.pipeline.datamanager)
-    config.pipeline.datamanager.camera_res_scale_factor = PRINTED_PHOTO_SCALE
-    return config
-
-
 lang3dxl = MethodSpecification(
     config=_config("lang3dxl", 30_000, learning_rates()),
     description="Lang3D-XL: language in large 3D scenes, from photo collections; on CUDA and on any CPU.",
 )
+_paper = _config("lang3dxl-paper", 70_000, printed_learning_rates())
+as_printed(_paper.pipeline.model, _paper.pipeline.datamanager)
+_paper.pipeline.datamanager.camera_res_scale_factor = PRINTED_PHOTO_SCALE
 lang3dxl_paper = MethodSpecification(
-    config=_paper_config(),
+    config=_paper,
     description="Lang3D-XL as in its paper: codes trained with the scene, composited, then decoded.",
 )
 METHODS = {"lang3dxl": lang3dxl, "lang3dxl-paper": lang3dxl_paper}

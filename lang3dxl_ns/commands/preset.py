@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 import tyro
 
 from lang3dxl_ns.commands.train import Train
-from lang3dxl_ns.common.presets import OFFICIAL, scene_presets, short_train_flags, train_flags
+from lang3dxl_ns.common.presets import OFFICIAL, scene_presets, train_flags
 
 
 @dataclass
@@ -31,7 +31,5 @@ class Preset:
         if not self.name:
             print("\n".join([OFFICIAL, *scene_presets()]))
             return
-        flags = train_flags(self.name)
-        if self.command == "train":
-            flags = short_train_flags(self.name, {setting.name for setting in fields(Train)})
-        print(shlex.join(flags))
+        known = {setting.name for setting in fields(Train)} if self.command == "train" else None
+        print(shlex.join(train_flags(self.name, known)))

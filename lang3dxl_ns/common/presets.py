@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Container
 from pathlib import Path
 from typing import Any
@@ -37,34 +38,23 @@ def scene_presets() -> list[str]:
     return sorted(f"holyscenes/{path.stem}" for path in FOLDER.glob("holyscenes/*.yaml"))
 
 
-def train_flags(name: str) -> list[str]:
-    """Return flags of `ns-train lang3dxl-paper`: a scene's crop range and schedule, or what the authors'
-    release does differently. Raises UserError for another name."""
-    return [word for flag, value in _for_training(name).items() for word in (f"--{flag}", str(value))]
-
-
-def short_train_flags(name: str, known: Container[str]) -> list[str]:
-    """Return the same for `lang3dxl train`, which has the settings `known`. Raises UserError also for a
-    preset with others."""
-    flags = {_short(flag): value for flag, value in _for_training(name).items()}
-    if missing := [flag for flag in flags if flag.replace("-", "_") not in known]:
-        raise UserError(
-            f"lang3dxl train has no {', '.join(missing)}, which {name} sets: leave --command off, and use "
-            "ns-train lang3dxl-paper"
-        )
-    words = [word for flag, value in flags.items() for word in (f"--{flag}", str(value))]
-    return ["--method", "lang3dxl-paper", *words]
-
-
-def _for_training(name: str) -> dict[str, Any]:
+def train_flags(name: str, known: Container[str] | None = None) -> list[str]:
+    """Return flags of a scene's crop range and schedule, or of what the authors' release does differently:
+    those of `ns-train lang3dxl-paper` or, with the settings that it has (`known`), of `lang3dxl train`.
+    Raises UserError for another name, and if that lacks a setting."""
     choices = [OFFICIAL, *scene_presets()]
     if name not in choices:
         raise UserError(f"{name!r} is not a preset for training: choose one of {', '.join(choices)}")
     settings = load_preset(name)
     scale = {"pipeline.datamanager.scale-preset": name} if "scale_range" in settings else {}
-    return scale | settings["train"]
-
-
-def _short(flag: str) -> str:
-    flag = flag.removeprefix("pipeline.model.").removeprefix("pipeline.datamanager.")
-    return "steps" if flag == "max-num-iterations" else flag
+    flags = scale | settings["train"]
+    if known is not None:
+        shorter = (re.sub(r"^pipeline\.(model|datamanager)\.", "", flag) for flag in flags)
+        names = ["steps" if flag == "max-num-iterations" else flag for flag in shorter]
+        if missing := [flag for flag in names if flag.replace("-", "_") not in known]:
+            raise UserError(
+                f"lang3dxl train has no {', '.join(missing)}, which {name} sets: leave --command off, and "
+                "use ns-train lang3dxl-paper"
+            )
+        flags = {"method": "lang3dxl-paper", **dict(zip(names, flags.values(), strict=True))}
+    return [word for flag, value in flags.items() for word in (f"--{flag}", str(value))]

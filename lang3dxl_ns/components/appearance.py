@@ -136,10 +136,6 @@ class AppearanceField(nn.Module):
             gaussians = replace(gaussians, opacities=opacities)
         return colors, gaussians
 
-    def network_parameters(self) -> list[nn.Parameter]:
-        """Return the parameters that all photos share, which are all but `vectors`."""
-        return [parameter for parameter in self.parameters() if parameter is not self.vectors]
-
     def vector(self, name: str) -> Float[Tensor, " v"]:
         """Return the vector of a training photo. Raises UserError if none has this name."""
         if name not in self._rows:

@@ -80,11 +80,7 @@ def _supersplat(path: Path, tables: dict[str, Table]) -> Splats:
     expect(chunks == -(-count // 256), f"{count:,} Gaussians don't lie in {chunks:,} chunks")
     expect("sh" not in tables or tables["sh"].length == count, "its harmonics are of other Gaussians")
     check_memory(count, ALL_BANDS)
-    return of_gsply(gsply.plyread(path))
-
-
-def of_gsply(data: Any) -> Splats:
-    """Build splats from what gsply read."""
+    data = gsply.plyread(path)
     parts = [np.asarray(part) for part in (data.sh0, data.shN) if part is not None]
     bands = np.concatenate([part.reshape(len(data.means), -1, 3) for part in parts], axis=1)
     return activated(data.means, data.scales, data.quats, data.opacities, bands)

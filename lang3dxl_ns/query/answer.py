@@ -54,14 +54,6 @@ def matches(scene: Answering, question: Question, place: Place, size: int | None
     ]
 
 
-def best_matches(scene: Answering, question: Question, size: int | None = None) -> list[Match]:
-    """Find each prompt's match in the training view that shows it best. Raises UserError if the scene has no
-    training photos."""
-    names = best_views(scene, question)
-    questions = [question.alone(row) for row in range(len(question.prompts))]
-    return [matches(scene, q, name, size)[0] for q, name in zip(questions, names, strict=True)]
-
-
 def locate(scene: Answering, question: Question, most: int = 10) -> list[Found]:
     """Find matches of a question's prompts in the scene, with at most `most` views each."""
     found = []

@@ -7,6 +7,7 @@ from dataclasses import KW_ONLY, dataclass, field
 from functools import cached_property
 from pathlib import Path
 
+import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
@@ -19,8 +20,9 @@ from lang3dxl_ns.query.rendered_scene import RenderedScene
 from lang3dxl_ns.query.text import NO_SEMANTICS, EncodeTexts, Prompt, TextEncoder, text_encoder
 from lang3dxl_ns.query.thresholds import match_thresholds, matching
 from lang3dxl_ns.query.trust import ANCHORS, foreignness
-from lang3dxl_ns.query.visibility import VisibleGaussians, measured, median_distance, total_pixels
+from lang3dxl_ns.query.visibility import VisibleGaussians, measured
 from lang3dxl_ns.query.vocabulary import searched
+from lang3dxl_ns.scene.camera import in_camera_frame
 from lang3dxl_ns.words.taught_words import TaughtWord
 
 
@@ -54,13 +56,18 @@ class Answering(RenderedScene):
     @cached_property
     def mass(self) -> Float[Tensor, " n"]:
         """Pixels that every Gaussian fills, summed over all views."""
-        return total_pixels(self.visible, self.splats.means)
+        mass = self.splats.means.new_zeros(len(self.splats))
+        for view in self.visible.values():
+            mass[view.rows.long()] += view.pixels.float()
+        return mass
 
     @cached_property
     def gap(self) -> float:
         """Distance in world units below which matches are connected: 3 % of the median distance at which the
         scene is seen, about eight pixels of a small view; 0 if no training photo shows anything."""
-        return 0.03 * median_distance(self.visible, self.splats.means)
+        seen, means = [view for view in self.visible.values() if len(view.rows)], self.splats.means
+        depths = [float(in_camera_frame(view.camera, means[view.rows])[:, 2].median()) for view in seen]
+        return 0.03 * float(torch.tensor(depths).nanmedian()) if depths else 0.0
 
     # ── prompts ─────────────────────────────────────────────────────────────────────────────────────
 

@@ -122,9 +122,11 @@ class Scene(Answering):
             UserError: see `ask` and `camera`.
         """
         question = self.ask(texts, negatives=negatives, threshold=threshold)
-        if place is None:
-            return _one_or_all(texts, answer.best_matches(self, question, size))
-        return _one_or_all(texts, answer.matches(self, question, place, size))
+        if place is not None:
+            return _one_or_all(texts, answer.matches(self, question, place, size))
+        best = enumerate(answer.best_views(self, question))
+        found = [answer.matches(self, question.alone(row), photo, size)[0] for row, photo in best]
+        return _one_or_all(texts, found)
 
     def matches(self, question: Question, place: Place, size: int | None = None) -> list[Match]:
         """Find matches of a question's prompts in one view; see `query`."""

@@ -19,7 +19,7 @@ from lang3dxl_ns.common.files import check_regular, replace_file
 from lang3dxl_ns.preparation.store import hash_tensors
 from lang3dxl_ns.rendering import Splats, composite
 from lang3dxl_ns.rendering.gathering import filled_pixels
-from lang3dxl_ns.scene.camera import Camera, in_camera_frame, resized
+from lang3dxl_ns.scene.camera import Camera, resized
 from lang3dxl_ns.scene.record import SceneRecord
 
 _LEAST = 1e-3
@@ -92,21 +92,6 @@ def measured(
     if cache is not None and views:
         save_visible(cache, views, key)
     return views
-
-
-def total_pixels(views: Mapping[str, VisibleGaussians], means: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
-    """Sum the pixels that every Gaussian fills over all views."""
-    mass = means.new_zeros(len(means))
-    for view in views.values():
-        mass[view.rows.long()] += view.pixels.float()
-    return mass
-
-
-def median_distance(views: Mapping[str, VisibleGaussians], means: Float[Tensor, "n 3"]) -> float:
-    """Compute the median over views of the median depth of what they show, in world units; 0 without any."""
-    seen = [view for view in views.values() if len(view.rows)]
-    distances = [float(in_camera_frame(view.camera, means[view.rows])[:, 2].median()) for view in seen]
-    return float(torch.tensor(distances).nanmedian()) if distances else 0.0
 
 
 def fingerprint(state: Mapping[str, Tensor], settings: object) -> str:

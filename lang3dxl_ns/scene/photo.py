@@ -131,8 +131,12 @@ class Photo(HasLens):
             return hashlib.blake2b(self.path.read_bytes(), digest_size=16).hexdigest()
 
     def _decoded(self, at_least: tuple[int, int]) -> Image.Image:
-        """Decode the file upright and still distorted; a large file may be shrunk, not below `at_least`."""
-        image = _read_rgb(self.path, self.name, _turned_size(at_least, self.quarter_turns))
+        """Decode the file to 8-bit RGB without alpha, upright and still distorted. A large JPEG may be
+        shrunk, not below `at_least`."""
+        with _readable(self.path, self.name), open_picture(self.path) as file:
+            if file.width * file.height > _LARGE:
+                file.draft(None, _turned_size(at_least, self.quarter_turns))  # does nothing for other formats
+            image = eight_bits(file).convert("RGB")
         return image.transpose(_TURNS[self.quarter_turns]) if self.quarter_turns else image
 
     def _drawn_upright(self, drawn: Any) -> Any:
@@ -216,14 +220,6 @@ def _readable(path: Path, name: str) -> Iterator[None]:
         raise UserError(
             f"photo {name}: can't read {path} ({error}): remove it, or convert it to an 8-bit JPEG or PNG"
         ) from error
-
-
-def _read_rgb(path: Path, name: str, at_least: tuple[int, int] | None = None) -> Image.Image:
-    """Decode a file as stored to 8-bit RGB without alpha; large JPEGs may be shrunk, not below `at_least`."""
-    with _readable(path, name), open_picture(path) as image:
-        if at_least is not None and image.width * image.height > _LARGE:
-            image.draft(None, at_least)  # does nothing for other formats
-        return eight_bits(image).convert("RGB")
 
 
 def _check_shape(

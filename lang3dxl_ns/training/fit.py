@@ -35,7 +35,7 @@ from lang3dxl_ns.training.batches import TrainingData, settled
 from lang3dxl_ns.training.checkpoint import CHECKPOINT, as_damage, read_checkpoint, save_checkpoint
 from lang3dxl_ns.training.estimate import check_device, estimate
 from lang3dxl_ns.training.learn_codes import begin_codes, forget_words, learn_words
-from lang3dxl_ns.training.learning_rates import Rates, fitted_rates, learning_rates, printed_learning_rates
+from lang3dxl_ns.training.learning_rates import Rates, learning_rates, printed_learning_rates
 from lang3dxl_ns.training.memory import out_of_memory, plan
 from lang3dxl_ns.training.scene_settings import PRINTED_PHOTO_SCALE, Method, RunSettings
 from lang3dxl_ns.training.settings import TrainingSettings, as_printed, without_effect
@@ -127,7 +127,11 @@ class Settings(RunSettings):
         self.targets.check()
         scene, learned = self.scene.fitted(self.steps), self.scene.decoder.learns_from_renderings
         targets = settled(self.targets, learned, not learned or scene.codes_from == "photos")
-        return replace(self, scene=scene, targets=targets, rates=fitted_rates(self.rates, self.steps))
+        rates = {
+            name: (rate.fitted(self.steps), schedule and replace(schedule, total_steps=self.steps))
+            for name, (rate, schedule) in self.rates.items()
+        }
+        return replace(self, scene=scene, targets=targets, rates=rates)
 
 
 class Run:

@@ -124,14 +124,6 @@ Rates = Mapping[str, tuple[Rate, Schedule | None]]
 """Rate and schedule of each parameter group."""
 
 
-def fitted_rates(rates: Rates, iterations: int) -> Rates:
-    """Return the rates and schedules for a run of this many iterations."""
-    return {
-        name: (rate.fitted(iterations), schedule and replace(schedule, total_steps=iterations))
-        for name, (rate, schedule) in rates.items()
-    }
-
-
 def learning_rates() -> dict[str, tuple[Rate, Schedule | None]]:
     """Return the rates of every parameter group, for long and short runs, with schedules in fractions of the
     run."""

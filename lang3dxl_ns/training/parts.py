@@ -127,8 +127,11 @@ class Parts:
             if not self.semantics.decoder.needs_lifting:
                 groups["downsampler"] = list(self.semantics.downsampler.parameters())
         if self.appearance is not None:
-            groups["appearance_vectors"] = [self.appearance.vectors]
-            groups["appearance"] = self.appearance.network_parameters()
+            vectors = self.appearance.vectors
+            groups["appearance_vectors"] = [vectors]
+            groups["appearance"] = [
+                shared for shared in self.appearance.parameters() if shared is not vectors
+            ]
         return groups
 
     def matching(

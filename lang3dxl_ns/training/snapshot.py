@@ -6,6 +6,7 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager
 from copy import deepcopy
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from threading import Lock
 from typing import NamedTuple, TypeVar
@@ -103,22 +104,15 @@ class Snapshots:
         latest = self._latest
         encode_texts = latest.scene.encode_texts if latest else text_encoder(self.record, self.model.device)
         with self.lock, torch.no_grad():
+            copied = partial(snapshot, self.model, self.record, encode_texts=encode_texts, watch=self.watch)
             # Asked inside the lock, since training may end, and learn its words, while it is waited for.
             if not self.learning():
-                cache = self.run / "lang3dxl_visible.safetensors"
-                scene = snapshot(
-                    self.model, self.record, encode_texts=encode_texts, cache=cache, watch=self.watch
-                )
-                return Snapshot(scene, None)
+                return Snapshot(copied(cache=self.run / "lang3dxl_visible.safetensors"), None)
             try:
                 if self.model.learns_words_at_the_end:
                     self.watch("gathering the photos' features onto the present scene…")
                     self.learn()
                 # In training every snapshot is examined anew, so keep that brief.
-                brief = QueryConfig(views=24, view_side=160)
-                scene = snapshot(
-                    self.model, self.record, config=brief, encode_texts=encode_texts, watch=self.watch
-                )
-                return Snapshot(scene, self.model.step)
+                return Snapshot(copied(config=QueryConfig(views=24, view_side=160)), self.model.step)
             finally:
                 forget_words(self.model)

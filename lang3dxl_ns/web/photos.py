@@ -12,7 +12,6 @@ from PIL import Image
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.query.scene import Scene
-from lang3dxl_ns.query.visibility import spread
 from lang3dxl_ns.scene.camera import in_camera_frame
 from lang3dxl_ns.scene.photo_folder import find_photos
 from lang3dxl_ns.scene.record import SCENE_FILE, ScenePhoto, SceneRecord
@@ -28,11 +27,6 @@ _CUT, _WIDER, _STEEP, _BEHIND, _LARGE = 0.0003, 2.0, 0.9, 1.5, 3.0
 """Share of what a scene's views show that may lie beyond each side of the overview; how much farther than its
 photo an overview reaches, and up to which slope; how much farther than the middle of the scene what it shows
 may lie; and how much larger than most a Gaussian is that shows sky or ground."""
-
-
-def photos_shown(scene: Scene) -> list[ScenePhoto]:
-    """List the training photos whose cameras a page knows."""
-    return spread([photo for photo in scene.photos if photo.split == "train"], MOST_CAMERAS)
 
 
 def photo_json(photo: ScenePhoto, address: str | None) -> dict[str, Any]:

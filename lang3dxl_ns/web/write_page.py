@@ -36,7 +36,7 @@ from lang3dxl_ns.query.vocabulary import closest_word, common_words, same_thing,
 from lang3dxl_ns.things import find, grammar, join, outlines, pieces, thing
 from lang3dxl_ns.web import pack
 from lang3dxl_ns.web.levels import MOST_ROWS, SMALL, Levels, levels_of
-from lang3dxl_ns.web.photos import extent, photo_json, photos_shown, small_photo
+from lang3dxl_ns.web.photos import MOST_CAMERAS, extent, photo_json, small_photo
 from lang3dxl_ns.web.teach import PageWords
 from lang3dxl_ns.words.taught_words import TaughtWord, known_word
 
@@ -189,7 +189,7 @@ class Page:
     def _photos(self) -> _Part:
         """Describe the photos' cameras, and make small photos if asked for."""
         names, files = dict[str, str](), dict[str, bytes]()
-        shown = photos_shown(self.scene)
+        shown = spread([photo for photo in self.scene.photos if photo.split == "train"], MOST_CAMERAS)
         if self.photos is not None and self.live:
             names = {photo.name: f"api/photo?name={quote(photo.name)}" for photo in shown}
         elif self.photos is not None:
