@@ -111,11 +111,6 @@ class FeatureStore:
         with _opened(self.path(kind, name), f"{kind} of {name}") as file:
             return {key: tuple(file.get_slice(key).get_shape()) for key in file.keys()}  # noqa: SIM118
 
-    def settings(self, kind: str, name: str) -> dict[str, Any]:
-        """Read the settings that made an entry. Raises UserError like `read`."""
-        with _opened(self.path(kind, name), f"{kind} of {name}") as file:
-            return json.loads(file.metadata()["settings"])
-
     def is_current(self, kind: str, name: str, settings: dict[str, Any]) -> bool:
         """Return whether the entry exists, matches its checksum, and was made with these settings. A damaged
         one counts as absent."""
