@@ -135,7 +135,7 @@ def test_a_planted_string_is_found():
 
 STILL_ANY = {
     *("preparation/encoders.py model", "preparation/families.py model"),  # of transformers
-    *("preparation/needs.py photo", "files/ply.py data"),  # of pycolmap and gsply
+    "preparation/needs.py photo",  # of pycolmap
     *("scene/record.py file", "scene/transforms.py files"),  # from files
     *("files/scene_file.py kind", "rendering/simd.py kind"),  # of NumPy and numba
     "plugin/run_settings.py settings",  # of any class
