@@ -72,9 +72,8 @@ class Query(OfScene):
         results = _Results(self.out, question)
         labels = CocoLabels([prompt.text for prompt in question.prompts])
         for name, photo, asked in tracked(self._places(scene, question), "rendering"):
-            everything = len(asked) == len(question.prompts)
-            wanted = question if everything else scene.ask([question.prompts[i] for i in asked])
-            matches = scene.matches(wanted, photo)
+            found = scene.matches(question, photo)
+            matches = [found[i] for i in asked]
             results.add(name, asked, matches)
             if self.coco is not None:
                 size = scene.file.photo(photo).file_size

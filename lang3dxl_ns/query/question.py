@@ -6,7 +6,7 @@ restriction to a foreground are therefore decided here and nowhere else.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import torch
@@ -105,20 +105,6 @@ class Question:
     def gaussians(self) -> Bool[Tensor, "q n"]:
         """Mask of the Gaussians that match each prompt."""
         return matching(self.relevancy, self.thresholds)
-
-    def alone(self, row: int) -> Question:
-        """Return the question of one of these prompts."""
-        count, one = len(self.prompts), slice(row, row + 1)
-        rows = [row, *range(count, len(self.everywhere))]
-        return replace(
-            self,
-            prompts=self.prompts[one],
-            queries=self.queries.select(rows),
-            everywhere=self.everywhere[rows],
-            doubts=self.doubts[one],
-            trusts=self.trusts[one],
-            thresholds=self.thresholds[one],
-        )
 
     @torch.no_grad()
     def maps(

@@ -75,16 +75,6 @@ class Queries:
         rows = [word.vector.to(self.vectors)[None] for word in learned.values()]
         return replace(self, vectors=torch.cat([self.vectors, *rows]), learned=learned)
 
-    def select(self, rows: Sequence[int]) -> Queries:
-        """Return the prompts with these indices, over the same vectors."""
-        positive, negative = (tuple(of[row] for row in rows) for of in (self.positive, self.negative))
-        texts, taught = self.vectors.split([len(self.vectors) - len(self.learned), len(self.learned)])
-        places = {old: place for place, old in enumerate(self.learned)}
-        chosen = [old for old in rows if old in places]
-        learned = {new: self.learned[old] for new, old in enumerate(rows) if old in places}
-        vectors = torch.cat([texts, taught[[places[old] for old in chosen]]])
-        return Queries(vectors, positive, negative, learned)
-
     def to(self, device: torch.device | str) -> Queries:
         """Return a copy on another device."""
         return replace(self, vectors=self.vectors.to(device))

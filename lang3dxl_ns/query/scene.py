@@ -124,9 +124,9 @@ class Scene(Answering):
         question = self.ask(texts, negatives=negatives, threshold=threshold)
         if place is not None:
             return _one_or_all(texts, answer.matches(self, question, place, size))
-        best = enumerate(answer.best_views(self, question))
-        found = [answer.matches(self, question.alone(row), photo, size)[0] for row, photo in best]
-        return _one_or_all(texts, found)
+        best = answer.best_views(self, question)
+        seen = {photo: answer.matches(self, question, photo, size) for photo in dict.fromkeys(best)}
+        return _one_or_all(texts, [seen[photo][row] for row, photo in enumerate(best)])
 
     def matches(self, question: Question, place: Place, size: int | None = None) -> list[Match]:
         """Find matches of a question's prompts in one view; see `query`."""
