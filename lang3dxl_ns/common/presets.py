@@ -53,8 +53,8 @@ def train_flags(name: str, known: Container[str] | None = None) -> list[str]:
         names = ["steps" if flag == "max-num-iterations" else flag for flag in shorter]
         if missing := [flag for flag in names if flag.replace("-", "_") not in known]:
             raise UserError(
-                f"lang3dxl train has no {', '.join(missing)}, which {name} sets: leave --command off, and "
-                "use ns-train lang3dxl-paper"
+                f"lang3dxl train has no {', '.join(missing)}, which {name} sets: train with "
+                "ns-train lang3dxl-paper, whose flags are printed by default"
             )
         flags = {"method": "lang3dxl-paper", **dict(zip(names, flags.values(), strict=True))}
     return [word for flag, value in flags.items() for word in (f"--{flag}", str(value))]

@@ -74,5 +74,5 @@ def test_lang3dxl_train_takes_the_flags_of_scenes_that_it_has_all_settings_of(ca
         assert (given.method, given.steps) == ("lang3dxl-paper", 70_000)
         assert given.scale_preset == f"holyscenes/{scene}"
     for name in ("official", "holyscenes/badshahi"):
-        with pytest.raises(SystemExit, match="leave --command off, and use ns-train"):
+        with pytest.raises(SystemExit, match="lang3dxl train has no"):
             cli.main(["preset", name, "--command", "train"])
