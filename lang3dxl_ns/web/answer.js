@@ -1,5 +1,8 @@
 // Answers: relevancy from cosines, the threshold above which a place matches, and doubt, as in Python's query/.
 
+import language from "./language.js";
+
+const { PRESENT } = language.things;
 const TIE = 0.999; // values that are equal in Python may differ by this factor in 16 bits
 
 export const sigmoid = (x) => 1 / (1 + Math.exp(-x));
@@ -101,6 +104,17 @@ export class Answers {
     });
     const named = scored.sort((a, b) => b[1] - a[1]).find(([word]) => word !== "sky")[1] > words.rules.clear;
     return named || !vocabulary.nothing.includes(others.indexOf(Math.max(...others))) ? scored.slice(0, most) : [];
+  }
+
+  /** Name the common word that [row, weight] pairs fit clearly better than a prompt and the common words in that, as in
+   * Python's things/find.py; null if none does. */
+  better(weighted, { name, own }) {
+    const { rows, vocabulary, words } = this, blend = new Float64Array(rows.width), clearly = Math.log(PRESENT / (1 - PRESENT));
+    for (const [i, weight] of weighted) rows.row(i).forEach((value, k) => (blend[k] += weight * value));
+    const length = norm(blend, words.gram), fit = (vector) => (words.temperature * dot(blend, vector)) / length;
+    const fits = vocabulary.words.slice(0, vocabulary.common).map((_, i) => fit(vocabulary.word(i).own)), most = Math.max(...fits);
+    const mine = Math.max(fit(own), ...vocabulary.commonIn(name).map((i) => fits[i]));
+    return most - mine > clearly ? vocabulary.words[fits.findIndex((one) => one > most - clearly)] : null;
   }
 }
 

@@ -21,7 +21,7 @@ export class List extends EventTarget {
   /** Find a prompt's things, once for each of its answers; resolves to { things, candidates }. */
   async find(prompt) {
     const { turn, relevancy } = prompt;
-    if (prompt.counting?.turn !== turn) prompt.counting = { turn, found: this.think("things", { relevancy, taught: Boolean(prompt.taught || prompt.examples) }) };
+    if (prompt.counting?.turn !== turn) prompt.counting = { turn, found: this.think("things", { text: prompt.text, relevancy, taught: Boolean(prompt.taught || prompt.examples) }) };
     const found = await prompt.counting.found;
     if (prompt.turn !== turn || prompt.found === found) return found;
     prompt.found = found;
@@ -34,8 +34,8 @@ export class List extends EventTarget {
   /** Build the part of a prompt's card that lists its things; null before they are found. */
   part(prompt) {
     if (!prompt.found) return null;
-    const { things } = prompt.found;
-    if (!things.length) return element("p", {}, "No single things found.");
+    const { things, better } = prompt.found;
+    if (!things.length) return element("p", {}, `No single things found${better ? `: what was found fits ${better} better` : ""}.`);
     const summary = element("summary", {}, count(prompt.found, this.about.detail ? " found in the coarse scene" : " found"));
     const made = element("details", { className: "things", open: Boolean(prompt.listed) }, summary);
     summary.addEventListener("click", (event) => {

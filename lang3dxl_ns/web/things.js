@@ -6,7 +6,7 @@ import { fitted } from "./like.js";
 import { BLUR, spreadAt } from "./pick.js";
 import { seenAt } from "./space.js";
 
-const { LEVELS, LEAST, PART, DEPTH, FILLED, SHARED, SPLINTER, VIEWS, CRUMB, OFTEN, OVER, OVERLAP, OUTLIERS, COLORED, PRESENT, SLIM, STRAIGHT, ROUND, CROWN, LIGHT, PLACES, SHOWN } = language.things;
+const { LEVELS, LEAST, PART, DEPTH, FILLED, SHARED, SPLINTER, VIEWS, CRUMB, OFTEN, OVER, OVERLAP, OUTLIERS, COLORED, PRESENT, TOLD, SLIM, STRAIGHT, ROUND, CROWN, LIGHT, PLACES, SHOWN } = language.things;
 const SIDE = 256; // pixels of a view's longer side
 const HIDDEN = 1e-3; // of a pixel's light: what lies behind is not seen
 const HOT = 0.1; // share of a pixel that one hot Gaussian covers where the map may be hot
@@ -15,18 +15,21 @@ const FALLOFF = Float64Array.from({ length: 12 * FINE }, (_, k) => Math.exp(-k /
 const RIDGE = 0.1, ROUNDS = 12; // strength of the colors' regularization, Newton steps
 const DC = 0.28209479177387814; // of spherical harmonics: colors are compared as coefficients
 
-/** Find the things of a word: { things, candidates }, each largest first. views: as of find.js; scene: { centers, axes,
- * bytes (packed splats), mass, gap, edges (of boxes, a direction each), antialiased }, in one frame; taught: whether examples taught the word. */
-export function thingsOf(views, scene, relevancy, taught) {
+/** Find the things of a word: { things, candidates }, each largest first, and the word that all of them fit better, if there is
+ * one. views: as of find.js; scene: { centers, axes, bytes (packed splats), mass, gap, edges (of boxes, a direction each),
+ * antialiased }, in one frame; taught: whether examples taught the word; better: names what weighted rows fit better, or null. */
+export function thingsOf(views, scene, relevancy, taught, better) {
   const heat = sharpened(scene, relevancy), { mass } = scene;
   const weight = Float64Array.from(relevancy, (value, i) => Math.sqrt(mass[i]) * value);
   const box = ({ rows }) => uprightBox(rows, scene.centers, weight, scene.edges);
   const parts = grown(join(views.flatMap((view, v) => piecesOf(drawn(view, scene, heat), v)), weight, box), weight.length);
   const joined = placed(parts, parts.map(box));
   const isPresent = ({ rows }) => taught || rows.some((i) => relevancy[i] >= PRESENT);
-  const sure = new Set(withoutCrumbs(joined).filter((one) => photosOf(one).size >= VIEWS && isPresent(one)));
+  const fitting = withoutCrumbs(joined).filter((one) => photosOf(one).size >= VIEWS && isPresent(one)).sort((a, b) => b.weight - a.weight);
+  const words = fitting.map(({ rows }) => better(rows.filter((_, k) => k % (1 + Math.floor(rows.length / TOLD)) === 0).map((i) => [i, weight[i] ** 2])));
+  const sure = new Set(fitting.filter((_, k) => !words[k]));
   const listed = (some) => some.map((one) => described(one, scene, weight, relevancy)).sort((a, b) => b.weight - a.weight);
-  return { things: listed([...sure]), candidates: listed(joined.filter((one) => !sure.has(one))) };
+  return { things: listed([...sure]), candidates: listed(joined.filter((one) => !sure.has(one))), better: sure.size ? null : words[0] };
 }
 
 /** Whether a word names something here: its peak exceeds the lowest level. */

@@ -120,6 +120,12 @@ export class Vocabulary {
     return forms.map((form) => this.index.get(form.toLowerCase())).find((place) => place !== undefined);
   }
 
+  /** List the places of the common words that a prompt has, in singular or plural: *dark windows* has *window*. */
+  commonIn(text) {
+    const { target } = meaning(text), forms = target.toLowerCase().split(" ").flatMap((word) => [word, ...["s", "es"].map((end) => word.replace(new RegExp(`${end}$`), ""))]);
+    return [...Array(this.common).keys()].filter((i) => this.words[i].split(" ").every((word) => forms.includes(word)));
+  }
+
   /** Return whether a prompt means the same as a common word. */
   isSame(anchor, name) {
     return this.anchors[anchor].includes((this.words[this.place(name)] ?? name).toLowerCase());

@@ -128,12 +128,13 @@ const jobs = {
     return ranked.map((view) => ({ ...view, target: inWorld(view.target) }));
   },
 
-  /** Find the single things of an answer: { things, candidates }. */
-  things({ relevancy, taught }) {
+  /** Find the single things of an answer: see thingsOf. */
+  async things({ text, relevancy, taught }) {
     if (!isThere(relevancy, about.words.rules)) return { things: [], candidates: [] };
-    const found = thingsOf(views, { ...geometry, mass, gap: about.words.gap, edges: about.edges, antialiased: about.antialiased }, relevancy, taught);
+    const prompt = taught ? null : (await understood([text])).found[0], better = (weighted) => prompt && answers.better(weighted, prompt);
+    const found = thingsOf(views, { ...geometry, mass, gap: about.words.gap, edges: about.edges, antialiased: about.antialiased }, relevancy, taught, better);
     const placed = (thing) => ({ ...thing, center: inWorld(thing.center) });
-    return { things: found.things.map(placed), candidates: found.candidates.map(placed) };
+    return { ...found, things: found.things.map(placed), candidates: found.candidates.map(placed) };
   },
 
   /** Tell for each list of things, by their rows, which ones a view shows. */

@@ -65,7 +65,7 @@ _NUMBERS = (
     ("things", pieces, "LEVELS LEAST PART DEPTH FILLED"),
     ("things", join, "SHARED SPLINTER VIEWS CRUMB OFTEN OVER OVERLAP SLIM STRAIGHT ROUND CROWN"),
     ("things", thing, "OUTLIERS"),
-    ("things", find, "COLORED PRESENT SURE MISSED"),
+    ("things", find, "COLORED PRESENT TOLD SURE MISSED"),
     ("things", outlines, "LIGHT PLACES SHOWN"),
     ("things", grammar, "BESIDE INSIDE CLOSE"),
 )
@@ -290,6 +290,7 @@ class Page:
             if known is not None:  # what examples taught, in the scene's own numbers
                 learned[i] = self._taught(meaning, known)
         described = {"negatives": negatives, "words": words, "naming": len(naming), "special": special}
+        described["common"] = len(shipped_vocabulary())
         described["nothing"] = [i for i, phrase in enumerate(negatives) if phrase in NOTHING]
         described["taught"] = learned
         described["anchors"] = {

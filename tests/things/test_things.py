@@ -23,7 +23,7 @@ from lang3dxl_ns.things.outlines import outlined
 from lang3dxl_ns.things.pieces import Piece, Shown, pieces_of, split
 from lang3dxl_ns.things.thing import upright_box
 from lang3dxl_ns.things.write import coco, write_catalog
-from lang3dxl_ns.words.taught_words import mask_of
+from lang3dxl_ns.words.taught_words import Example, mask_of
 
 
 def bumps(*columns: int) -> np.ndarray:
@@ -212,6 +212,24 @@ def test_a_place_that_fits_less_than_things_do_is_a_candidate_beside_one_that_fi
         question.__dict__["relevancy"] = torch.where(right, share * plain, plain)
         (found,) = things_of(scene, question)
         assert (len(found.things), len(found.candidates)) == counts
+
+
+@pytest.mark.parametrize(("text", "count"), [("minarets", 0), ("windows", 2), ("rose windows", 2)])
+def test_what_another_word_explains_better_is_a_candidate_and_its_word_says_so(text, count):
+    scene = painted_scene()
+    question, windows = scene.ask(text), scene.ask("windows")
+    question.__dict__["relevancy"] = windows.relevancy  # such as by a synonym
+    (found,) = things_of(scene, question)
+    assert (len(found.things), len(found.candidates)) == (count, 2 - count)
+    assert (found.caution == "what was found fits 'window' better") == (count == 0)
+
+
+def test_no_other_word_explains_what_was_taught_better():
+    scene = painted_scene()
+    taught = scene.teach("minarets", Example("all/0003.jpg", points=((20.0, 64.0),)))
+    question = taught.ask("minarets")
+    question.__dict__["relevancy"] = scene.ask("windows").relevancy
+    assert len(things_of(taught, question)[0].things) == 2
 
 
 def test_a_sample_of_the_gaussians_tells_the_colors_of_a_word(monkeypatch):

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import asdict, replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,11 +12,12 @@ from pages import DESK, opened, served, until, until_linked
 from painted_scene import painted_scene
 
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.query.text import Prompt
 from lang3dxl_ns.query.trust import FAR
-from lang3dxl_ns.query.vocabulary import common_words
+from lang3dxl_ns.query.vocabulary import common_words, searched, shipped_vocabulary
 from lang3dxl_ns.rendering import Camera, Splats, composite
 from lang3dxl_ns.scene.camera import in_camera_frame
-from lang3dxl_ns.things.find import Things
+from lang3dxl_ns.things.find import Things, better_words
 from lang3dxl_ns.things.grammar import Sight, answer, assumed, parse, unsure
 from lang3dxl_ns.things.join import Joined, grown, join, placed, without_crumbs
 from lang3dxl_ns.things.outlines import shown
@@ -321,6 +323,38 @@ def test_a_word_that_hardly_fits_names_nothing_as_in_python(page):
     body = """const of = (peak) => Float32Array.from({ length: 1000 }, (_, i) => (i < 5 ? peak : 0.1));
       return given.map((peak) => m.isThere(of(peak), { best: 0.005 }));"""
     assert module(page, "things", body, [LEVELS[0] - 0.01, LEVELS[0] + 0.01]) == [False, True]
+
+
+def test_words_that_fit_things_better_are_those_of_python(page):
+    rng, words = np.random.default_rng(6), shipped_vocabulary()
+    prompts = ("minarets", "dark windows", "windows on the left tower", "Kuppel", "cross vault", "the gate")
+    texts = {text: torch.tensor(rng.normal(size=8)) for text in (*words, *map(searched, prompts))}
+    vectors = {text: F.normalize(vector, dim=0) for text, vector in texts.items()}
+    rows, weight = torch.tensor(rng.normal(size=(9, 8))), rng.random(9)
+    rows[:3] += 4 * vectors["window"]
+    rows[3:6] += 4 * vectors["vault"]
+    things = [Joined(np.arange(k, k + 3), 1.0, []) for k in (0, 3, 6)]
+    scene = SimpleNamespace(
+        device="cpu",
+        text=SimpleNamespace(vectors=lambda listed: torch.stack([vectors[text] for text in listed])),
+        engine=SimpleNamespace(features=lambda of: F.normalize(rows[of], dim=1), temperature=4.0),
+    )
+    unit, found = F.normalize(rows, dim=1).tolist(), list[str | None]()
+    body = """const { Vocabulary } = await import("./vocabulary.js"), { words, vectors } = given;
+      const vocabulary = Object.assign(Object.create(Vocabulary.prototype), { words, common: words.length });
+      vocabulary.word = (i) => ({ own: vectors[i] });
+      const rows = { width: 8, row: (i) => given.unit[i] };
+      const one = new m.Answers(rows, vocabulary, { temperature: 4 });
+      return given.weighted.map((some) => one.better(some, given.prompt));"""
+    for text in prompts:
+        better = better_words(scene, Prompt(text), things, weight)
+        prompt = {"name": text, "own": vectors[searched(text)].tolist()}
+        given = {"words": words, "vectors": [vectors[word].tolist() for word in words], "unit": unit}
+        given |= {"weighted": [[(int(i), weight[i]) for i in one.rows] for one in things], "prompt": prompt}
+        expected = [better.get(one) for one in things]
+        assert module(page, "answer", body, given) == expected, text
+        found += expected
+    assert found.count(None) > 2 and len({*found}) > 3
 
 
 def test_boxes_are_those_of_python(page):
