@@ -23,7 +23,7 @@ from lang3dxl_ns.query.trust import FAR
 from lang3dxl_ns.query.vocabulary import searched, shipped_vocabulary
 from lang3dxl_ns.rendering import composite, harmonics_of
 from lang3dxl_ns.scene.camera import in_camera_frame
-from lang3dxl_ns.things.join import VIEWS, Joined, grown, join, placed, without_crumbs
+from lang3dxl_ns.things.join import VIEWS, Joined, grown, join, parted, placed, without_crumbs
 from lang3dxl_ns.things.pieces import FILLED, LEVELS, Piece, Shown, pieces_of
 from lang3dxl_ns.things.thing import Box, Sighting, Thing, upright_box
 
@@ -34,6 +34,8 @@ SAMPLED = 50_000
 PAIRED, NEIGHBORS = 1_000, 3.0
 """Number of Gaussians, about, whose directions from each other tell where walls run, and their largest
 distance, relative to the gap between groups."""
+APART = 1.5
+"""Space around a part of a thing, relative to the gap between groups, from which it is a thing of its own."""
 HEIGHTS = 0.01, 0.9995
 """Shares of a landmark's Gaussians that lie below the ground, and below its top."""
 SURE = 0.6
@@ -110,11 +112,14 @@ def things_of(scene: Answering, question: Question) -> list[Things]:
         values = question.relevancy[i].double().cpu().numpy()
         weight = np.sqrt(mass) * values
         boxed = partial(box, weight)
-        parts = grown(join(pieces[i], weight, boxed), len(weight))
+        whole = grown(join(pieces[i], weight, boxed), len(weight))
+        parts = parted(whole, means @ axes[:2].T, weight, APART * scene.gap)
         joined = sorted(placed(parts, [boxed(part) for part in parts]), key=lambda one: -one.weight)
         seen = [one for one in without_crumbs(joined) if one.views >= VIEWS]
         sure = [one for one in seen if prompt.taught or values[one.rows].max() >= PRESENT]
-        better = better_words(scene, prompt, sure, weight**2) if sure and not prompt.taught else {}
+        better = (
+            better_words(scene, prompt, sure, (weight * values) ** 2) if sure and not prompt.taught else {}
+        )
         sure = [one for one in sure if one not in better]
         rest = [one for one in joined if one not in sure]
         things, candidates = (
@@ -136,6 +141,8 @@ def better_words(
     heat maps, and a word that the scene doubts is found by its synonyms: so *minarets* finds a cathedral's
     towers. `weight`: of each Gaussian, 0 and above."""
     text, words, better = searched(prompt.text), shipped_vocabulary(), dict[Joined, str]()
+    if not things:
+        return better  # before a CLIP encodes the words
     forms = {form for word in text.lower().split() for form in singulars(word)}
     named = [i for i, word in enumerate(words) if forms >= {*word.split()}]
     own = scene.text.vectors([text]) if prompt.vector is None else prompt.vector[None]

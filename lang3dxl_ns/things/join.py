@@ -132,6 +132,33 @@ def grown(things: Sequence[Joined], count: int) -> list[Joined]:
     return [replace(one, rows=order[a:b]) for one, (a, b) in parts if b > a + 1]
 
 
+def parted(
+    things: Sequence[Joined], level: Float[Array, "n 2"], weight: Float[Array, " n"], space: float
+) -> list[Joined]:
+    """Split off each part of a thing that an empty strip wider than `space`, along a level axis, separates from
+    all else, and that is no wider itself: pinnacles whose heat touches in every photo. A piece shows the parts
+    of which it shows enough. `level`: each Gaussian's place along two level axes, world units; `weight`: of
+    each Gaussian, 0 and above."""
+    found = list[Joined]()
+    for thing in things:
+        places = level[thing.rows]
+        order = places.argsort(axis=0)
+        steps = np.diff(np.take_along_axis(places, order, 0), axis=0, prepend=-np.inf) > space
+        strips = np.take_along_axis(steps.cumsum(0), order.argsort(axis=0), 0)
+        group = np.unique(strips, axis=0, return_inverse=True)[1].ravel()
+        wide = [np.ptp(places[group == number], axis=0).max() > space for number in range(group.max() + 1)]
+        group[np.array(wide)[group]] = -1  # wide parts stay together: sides of a dome
+        if len(np.unique(group)) == 1:
+            found.append(thing)
+            continue
+        for rows in (thing.rows[group == number] for number in np.unique(group)):
+            total = float(weight[rows].sum())
+            shown = [(piece, weight[piece.rows[np.isin(piece.rows, rows)]].sum()) for piece in thing.votes]
+            votes = [piece for piece, share in shown if share > SHARED * total]
+            found += [Joined(rows, total, votes)] if len(rows) > 1 and votes else []
+    return found
+
+
 def placed(things: Sequence[Joined], boxes: Sequence[Box]) -> list[Joined]:
     """Unite things whose boxes overlap, slim things with what stands on or below them (a minaret's shaft, its
     balcony and its tip), and deep things with what crowns them. `boxes` are the things' upright boxes."""

@@ -6,7 +6,7 @@ import { fitted } from "./like.js";
 import { BLUR, spreadAt } from "./pick.js";
 import { seenAt } from "./space.js";
 
-const { LEVELS, LEAST, PART, DEPTH, FILLED, SHARED, SPLINTER, VIEWS, CRUMB, OFTEN, OVER, OVERLAP, OUTLIERS, COLORED, PRESENT, TOLD, SLIM, STRAIGHT, ROUND, CROWN, LIGHT, PLACES, SHOWN } = language.things;
+const { LEVELS, LEAST, PART, DEPTH, FILLED, SHARED, SPLINTER, VIEWS, CRUMB, OFTEN, OVER, OVERLAP, OUTLIERS, COLORED, APART, PRESENT, TOLD, SLIM, STRAIGHT, ROUND, CROWN, LIGHT, PLACES, SHOWN } = language.things;
 const SIDE = 256; // pixels of a view's longer side
 const HIDDEN = 1e-3; // of a pixel's light: what lies behind is not seen
 const HOT = 0.1; // share of a pixel that one hot Gaussian covers where the map may be hot
@@ -22,11 +22,13 @@ export function thingsOf(views, scene, relevancy, taught, better) {
   const heat = sharpened(scene, relevancy), { mass } = scene;
   const weight = Float64Array.from(relevancy, (value, i) => Math.sqrt(mass[i]) * value);
   const box = ({ rows }) => uprightBox(rows, scene.centers, weight, scene.edges);
-  const parts = grown(join(views.flatMap((view, v) => piecesOf(drawn(view, scene, heat), v)), weight, box), weight.length);
+  const whole = grown(join(views.flatMap((view, v) => piecesOf(drawn(view, scene, heat), v)), weight, box), weight.length);
+  const level = (i) => scene.edges.slice(0, 2).map((axis) => axis.reduce((sum, value, k) => sum + value * scene.centers[3 * i + k], 0));
+  const parts = parted(whole, level, weight, APART * scene.gap);
   const joined = placed(parts, parts.map(box));
   const isPresent = ({ rows }) => taught || rows.some((i) => relevancy[i] >= PRESENT);
   const fitting = withoutCrumbs(joined).filter((one) => photosOf(one).size >= VIEWS && isPresent(one)).sort((a, b) => b.weight - a.weight);
-  const words = fitting.map(({ rows }) => better(rows.filter((_, k) => k % (1 + Math.floor(rows.length / TOLD)) === 0).map((i) => [i, weight[i] ** 2])));
+  const words = fitting.map(({ rows }) => better(rows.filter((_, k) => k % (1 + Math.floor(rows.length / TOLD)) === 0).map((i) => [i, (weight[i] * relevancy[i]) ** 2])));
   const sure = new Set(fitting.filter((_, k) => !words[k]));
   const listed = (some) => some.map((one) => described(one, scene, weight, relevancy)).sort((a, b) => b.weight - a.weight);
   return { things: listed([...sure]), candidates: listed(joined.filter((one) => !sure.has(one))), better: sure.size ? null : words[0] };
@@ -288,6 +290,30 @@ export function grown(things, count) {
   });
   owner.forEach((t, i) => t >= 0 && own[t].push(i));
   return things.map((thing, t) => ({ ...thing, rows: own[t] })).filter(({ rows }) => rows.length > 1);
+}
+
+/** Split off each part of a thing that an empty strip separates from all else, and that is no wider: see things/join.py.
+ * level: returns a Gaussian's place along two level axes; space: the strip's least width. */
+export function parted(things, level, weight, space) {
+  return things.flatMap((thing) => {
+    const { rows } = thing, places = rows.map(level), strips = rows.map(() => ""), groups = new Map();
+    for (const axis of [0, 1]) {
+      let strip = 0;
+      [...rows.keys()].sort((a, b) => places[a][axis] - places[b][axis]).forEach((k, n, order) => {
+        if (n && places[k][axis] - places[order[n - 1]][axis] > space) strip++;
+        strips[k] += `${strip} `;
+      });
+    }
+    strips.forEach((strip, k) => (groups.get(strip) ?? groups.set(strip, []).get(strip)).push(k));
+    const isWide = (some) => [0, 1].some((axis) => some.reduce((most, k) => Math.max(most, places[k][axis]), -Infinity) - some.reduce((least, k) => Math.min(least, places[k][axis]), Infinity) > space);
+    const wide = [...groups.values()].filter(isWide), parts = [...[...groups.values()].filter((some) => !isWide(some)), ...(wide.length ? [wide.flat()] : [])];
+    if (parts.length === 1) return [thing];
+    return parts.flatMap((part) => {
+      const own = new Set(part.map((k) => rows[k])), sum = (some) => some.reduce((all, i) => all + (own.has(i) ? weight[i] : 0), 0), total = sum(rows);
+      const votes = thing.votes.filter((piece) => sum(piece.rows) > SHARED * total);
+      return own.size > 1 && votes.length ? [{ ...thing, rows: [...own], weight: total, votes }] : [];
+    });
+  });
 }
 
 /** Unite things whose boxes overlap, slim ones with what stands on or below them, deep ones with what crowns them. */

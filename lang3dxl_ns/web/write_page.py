@@ -65,7 +65,7 @@ _NUMBERS = (
     ("things", pieces, "LEVELS LEAST PART DEPTH FILLED"),
     ("things", join, "SHARED SPLINTER VIEWS CRUMB OFTEN OVER OVERLAP SLIM STRAIGHT ROUND CROWN"),
     ("things", thing, "OUTLIERS"),
-    ("things", find, "COLORED PRESENT TOLD SURE MISSED"),
+    ("things", find, "COLORED APART PRESENT TOLD SURE MISSED"),
     ("things", outlines, "LIGHT PLACES SHOWN"),
     ("things", grammar, "BESIDE INSIDE CLOSE"),
 )

@@ -18,7 +18,7 @@ from lang3dxl_ns.scene.camera import in_camera_frame
 from lang3dxl_ns.scene.georeference import Georeference
 from lang3dxl_ns.things.find import PRESENT, Things, axes_of, heights_of, things_of, up_of
 from lang3dxl_ns.things.grammar import sight_of
-from lang3dxl_ns.things.join import OFTEN, Joined, grown, join, placed, without_crumbs
+from lang3dxl_ns.things.join import OFTEN, Joined, grown, join, parted, placed, without_crumbs
 from lang3dxl_ns.things.outlines import outlined
 from lang3dxl_ns.things.pieces import Piece, Shown, pieces_of, split
 from lang3dxl_ns.things.thing import upright_box
@@ -370,6 +370,21 @@ def test_strays_do_not_move_the_ground():
 def test_a_count_allows_for_things_that_no_photo_shows_well(found, more, said):
     each = [thing(i, "window", (i, 0, 0), views=9) for i in range(found + more)]
     assert Things("window", each[:found], each[found:]).count == said
+
+
+def test_what_an_empty_strip_separates_is_a_thing_of_its_own_unless_it_is_wide():
+    def parts(*ends: tuple[float, float]) -> list[list[int]]:
+        """Of a thing that reaches from each of these ends to the other along the first axis."""
+        level = np.array([(place, 0.0) for low, high in ends for place in np.linspace(low, high, 10)])
+        rows = np.arange(len(level))
+        piece = Piece("0", rows, 1.0, 9, (0, 0, 1, 1), False)
+        found = parted([Joined(rows, 1.0, [piece])], level, np.ones(len(level)), 1.0)
+        return sorted([*dict.fromkeys((one.rows // 10).tolist())] for one in found)
+
+    assert parts((0, 0.5), (2, 2.5)) == [[0], [1]]
+    assert parts((0, 0.5), (1.4, 1.9)) == [[0, 1]]  # near
+    assert parts((0, 3), (5, 5.5)) == [[0], [1]]
+    assert parts((0, 3), (5, 8)) == [[0, 1]]  # sides of a dome
 
 
 def test_things_are_one_where_their_boxes_overlap_or_one_stands_on_the_other():

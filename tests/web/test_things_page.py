@@ -19,7 +19,7 @@ from lang3dxl_ns.rendering import Camera, Splats, composite
 from lang3dxl_ns.scene.camera import in_camera_frame
 from lang3dxl_ns.things.find import Things, better_words
 from lang3dxl_ns.things.grammar import Sight, answer, assumed, parse, unsure
-from lang3dxl_ns.things.join import Joined, grown, join, placed, without_crumbs
+from lang3dxl_ns.things.join import Joined, grown, join, parted, placed, without_crumbs
 from lang3dxl_ns.things.outlines import shown
 from lang3dxl_ns.things.pieces import LEVELS, Piece, split
 from lang3dxl_ns.things.thing import Thing, upright_box
@@ -296,6 +296,29 @@ def test_pieces_join_as_in_python(page):
     )
     assert len(found) > 5
     assert sorted(found) == sorted([sorted(one.rows.tolist()), one.views] for one in expected)
+
+
+def test_parts_that_empty_strips_separate_are_those_of_python(page):
+    rng, things = np.random.default_rng(7), []
+    places = np.concatenate([rng.normal(size=(20, 2)) * 0.1 + rng.uniform(0, 4, 2) for _ in range(40)])
+    places[:20] = rng.uniform(0, 2, (20, 2))  # wide
+    for start in range(0, 800, 100):
+        rows, votes = np.arange(start, start + 100), []
+        for _ in range(6):
+            shown = np.sort(rng.choice(rows, 60, replace=False))
+            shown = shown[shown < start + 20 * rng.integers(1, 6)]
+            votes.append(Piece("0", shown, 1.0, 9, (0, 0, 1, 1), False))
+        things.append(Joined(rows, 1.0, votes))
+    weight = rng.random(800)
+    expected = parted(things, places, weight, 0.6)
+    assert len(expected) > len(things)
+    given = {"places": places.tolist(), "weight": weight.tolist()}
+    given["things"] = [{"rows": one.rows.tolist(), "weight": 1, "votes": [{"rows": p.rows.tolist()} for p in
+                       one.votes]} for one in things]  # fmt: skip
+    body = """return m.parted(given.things, (i) => given.places[i], given.weight, 0.6).map(
+      ({ rows, votes }) => [rows.toSorted((a, b) => a - b), votes.length]);"""
+    found = module(page, "things", body, given)
+    assert sorted(found) == sorted([sorted(one.rows.tolist()), len(one.votes)] for one in expected)
 
 
 @pytest.mark.parametrize(
