@@ -36,7 +36,7 @@ class ListThings(OfScene):
         from lang3dxl_ns.open_scene import load_scene
         from lang3dxl_ns.query.ask import prompts_of
         from lang3dxl_ns.query.text import Prompt, caution
-        from lang3dxl_ns.things.grammar import Request, in_words, meant, parse, sight_of
+        from lang3dxl_ns.things.grammar import Request, answered, meant, parse, sight_of
         from lang3dxl_ns.things.write import each_word_once, table, write_catalog, write_picture, write_things
 
         if not (self.text or self.ask):
@@ -71,7 +71,7 @@ class ListThings(OfScene):
         for text, request in requests.items():
             try:
                 found = [by_word[word] for word in request.words]
-                say(f"{text}: {in_words(request, found, lambda things: seen or sight_of(scene, things))}")
+                say(f"{text}: {answered(request, found, lambda things: seen or sight_of(scene, things))}")
             except UserError as error:
                 refused.append(_refusal(text, error))
         if self.out is not None and answers:

@@ -31,6 +31,7 @@ from lang3dxl_ns.words.teach import carried_word, learned_word, least_certain_ph
 
 if TYPE_CHECKING:
     from lang3dxl_ns.things.find import Things
+    from lang3dxl_ns.things.grammar import Answer
 
 _ROWS = 65_536
 """Number of Gaussians decoded at a time."""
@@ -237,6 +238,22 @@ class Scene(Answering):
 
         return things_of(self, self.ask(texts))
 
+    def answer(self, question: str, view: str | None = None) -> Answer:
+        """Answer a question about things, such as "how many windows" or "the window left of the portal".
+
+        Args:
+            question: a sentence of the grammar of docs/things.md.
+            view: photo from which left and right are told, among what it shows; default: the one that shows
+                most of the things, as if it showed all.
+
+        Raises:
+            UserError: the grammar doesn't know the question, what it refers to is not found, or no photo has
+                this name.
+        """
+        from lang3dxl_ns.things.grammar import answer_question
+
+        return answer_question(self, question, view)
+
     # ── features ────────────────────────────────────────────────────────────────────────────────────
 
     def encode(self, texts: str | Sequence[str]) -> Float[Array, "n c"]:
@@ -290,9 +307,9 @@ class Scene(Answering):
         return least_certain_photo(self, word)
 
 
-Answer = TypeVar("Answer", Match, Found)
+Result = TypeVar("Result", Match, Found)
 
 
-def _one_or_all(texts: object, found: list[Answer]) -> Answer | list[Answer]:
+def _one_or_all(texts: object, found: list[Result]) -> Result | list[Result]:
     """Return all answers to a list of texts, or to a text that holds several prompts; else the only one."""
     return found if isinstance(texts, list | tuple) or len(found) > 1 else found[0]

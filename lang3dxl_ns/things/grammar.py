@@ -19,11 +19,13 @@ from numpy import ndarray as Array
 from lang3dxl_ns.common.console import some
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import read_json
+from lang3dxl_ns.query.answering import Answering
+from lang3dxl_ns.query.ask import ask
 from lang3dxl_ns.query.language import HELD, TABLE, held
-from lang3dxl_ns.query.scene import Scene
+from lang3dxl_ns.query.text import Prompt
 from lang3dxl_ns.query.vocabulary import closest_word, common_words
 from lang3dxl_ns.scene.record import ScenePhoto
-from lang3dxl_ns.things.find import MISSED, Things, up_of
+from lang3dxl_ns.things.find import MISSED, Things, things_of, up_of
 from lang3dxl_ns.things.outlines import shown
 from lang3dxl_ns.things.thing import Thing
 
@@ -81,7 +83,7 @@ class Sight:
     """Ids of the things that one sees: the order from left to right is theirs; None: all."""
 
 
-def sight_of(scene: Scene, things: list[Thing], photo: str | None = None) -> Sight:
+def sight_of(scene: Answering, things: list[Thing], photo: str | None = None) -> Sight:
     """Return the directions of a photo's viewer, and which of the things it shows; by default of the photo
     that shows most of them, as if it showed all."""
     names = [sighting.photo for thing in things for sighting in thing.sightings]
@@ -94,7 +96,7 @@ def sight_of(scene: Scene, things: list[Thing], photo: str | None = None) -> Sig
     return Sight(np.cross(ahead, up), up, ahead, None if photo is None else _shown(scene, taken, things))
 
 
-def _shown(scene: Scene, photo: ScenePhoto, things: list[Thing]) -> frozenset[int]:
+def _shown(scene: Answering, photo: ScenePhoto, things: list[Thing]) -> frozenset[int]:
     """List the things that a photo shows, whether they were found in it or not."""
     words = {thing.word: [other for other in things if other.word == thing.word] for thing in things}
     seen = (shown(scene.splats, photo.camera, of_word) for of_word in words.values())
@@ -212,19 +214,42 @@ def assumed(request: Request, found: Sequence[Things], sight: Facing) -> str:
     return "; ".join(several)
 
 
-def in_words(request: Request, found: Sequence[Things], sight: Facing) -> str:
-    """Answer a request in words: a number, or ids and a photo of each, and what may be wrong with it.
-    Arguments and errors are those of `answer`."""
+@dataclass(frozen=True, eq=False)
+class Answer:
+    """The answer to a question about things. As a text it has all of it."""
+
+    text: str
+    """A number, or how many things were found, with their ids and a photo of each."""
+    things: list[Thing]
+    """The things that the question asks for."""
+    caution: str | None
+    """What may be wrong with the answer; None if nothing is known to be."""
+
+    def __str__(self) -> str:
+        return self.text + (f" ({self.caution})" if self.caution else "")
+
+
+def answered(request: Request, found: Sequence[Things], sight: Facing) -> Answer:
+    """Answer a request. Arguments and errors are those of `answer`."""
     chosen = answer(request, found, sight)
-    if request == Request(request.word, count=True):
-        return found[0].count  # whose range tells how sure it is
-    told = f"{len(chosen)}"
+    counted = request == Request(request.word, count=True)
+    told = found[0].count if counted else f"{len(chosen)}"  # a count's range tells how sure it is
     if not request.count:
-        listed = some([f"id {one.id} in {one.sightings[0].photo}" for one in chosen])
+        listed = some([f"id {one.id} in {one.best_photo}" for one in chosen])
         told = f"{told} found: {listed}" if chosen else "none found"
-    doubt = unsure(request, found, sight)
-    notes = assumed(request, found, sight), doubt and f"unsure, since {doubt}"
-    return told + "".join(f" ({note})" for note in notes if note)
+    doubt = None if counted else unsure(request, found, sight)
+    notes = [assumed(request, found, sight), doubt and f"unsure, since {doubt}"]
+    notes += [f"{one.word}: {one.caution}" for one in found if one.caution]
+    return Answer(told, chosen, "; ".join(filter(None, notes)) or None)
+
+
+def answer_question(scene: Answering, text: str, photo: str | None = None) -> Answer:
+    """Answer a question; see `Scene.answer`."""
+    request = parse(text, scene.words)
+    found = things_of(scene, ask(scene, [Prompt(word) for word in request.words]))
+    every = [thing for one in found for thing in (*one.things, *one.candidates)]
+    seen = None if photo is None else sight_of(scene, every, photo)
+    return answered(request, found, lambda things: seen or sight_of(scene, things))
 
 
 def unsure(request: Request, found: Sequence[Things], sight: Facing) -> str | None:

@@ -135,10 +135,10 @@ def grown(things: Sequence[Joined], count: int) -> list[Joined]:
 def parted(
     things: Sequence[Joined], level: Float[Array, "n 2"], weight: Float[Array, " n"], space: float
 ) -> list[Joined]:
-    """Split off each part of a thing that an empty strip wider than `space`, along a level axis, separates from
-    all else, and that is no wider itself: pinnacles whose heat touches in every photo. A piece shows the parts
-    of which it shows enough. `level`: each Gaussian's place along two level axes, world units; `weight`: of
-    each Gaussian, 0 and above."""
+    """Split off each part of a thing that an empty strip wider than `space` along a level axis separates from
+    all else, and that is no wider itself: pinnacles whose heat touches in every photo. A piece shows the
+    parts of which it shows enough. `level`: each Gaussian's place along two level axes, world units;
+    `weight`: of each Gaussian, 0 and above."""
     found = list[Joined]()
     for thing in things:
         places = level[thing.rows]

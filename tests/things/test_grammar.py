@@ -169,6 +169,22 @@ def test_a_relation_to_several_things_tells_that_any_counts():
     assert told("window between the gates", [found[0], Things("gates", gates[:2])]) == ""
 
 
+def test_a_scene_answers_with_text_things_and_caution():
+    scene = painted_scene()
+    counted = scene.answer("How many windows are there?")
+    assert (counted.text, len(counted.things), counted.caution) == ("2, perhaps 1 to 2", 2, None)
+    left = scene.answer("leftmost window")
+    (found,) = left.things
+    assert found.center[0] == min(one.center[0] for one in counted.things)
+    assert left.text == f"1 found: id {found.id} in {found.best_photo}"
+    assert str(left) == f"{left.text} ({left.caution})" and "unsure" in left.caution
+    assert "flamingo: " in scene.answer("how many flamingo").caution  # the word itself is doubted
+    with pytest.raises(UserError, match="only 2 found in this view"):
+        scene.answer("third window from the left", view=scene.overview.name)
+    with pytest.raises(UserError, match=r"absent\.jpg"):
+        scene.answer("highest window", view="absent.jpg")
+
+
 def test_every_phrase_of_the_table_is_reached():
     words = table()
     for phrase in words["relations"]:
