@@ -65,6 +65,8 @@ quarter more photos of a hall get one, but 15 points also agree on the wrong sid
 _ENOUGH, _MOST_STRONG = 0.9, 100
 """Share of photos with a pose from which plain features suffice, and most photos for stronger ones: half an
 hour of two cores."""
+_SOFT = 1.0
+"""Error in pixels from which a match counts less for the cameras in the end."""
 _RELAXED = {"init_min_num_inliers": 30, "init_min_tri_angle": 4.0, "abs_pose_min_num_inliers": 15}
 """Thresholds of the incremental mapper where it finds no model with the usual ones."""
 
@@ -252,7 +254,28 @@ def _map(
         models = [m for m in found.values() if m.num_reg_images() >= _SMALLEST_MODEL and m.num_points3D()]
         if models:
             break
+    models = [_completed(model, database, photos, work) for model in models]
     return sorted(models, key=lambda model: -model.num_reg_images())
+
+
+def _completed(
+    model: pycolmap.Reconstruction, database: Path, photos: PhotoFolder, work: Path
+) -> pycolmap.Reconstruction:
+    """Adjust the cameras once more, so that false matches count less, and add the points that only two photos
+    show. The mapper passes over these, since they say little about cameras. But Gaussians start from points,
+    and without them thin things are lost."""
+    pycolmap = load_pycolmap()
+    adjustment = pycolmap.BundleAdjustmentOptions(print_summary=False)
+    adjustment.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+    adjustment.ceres.loss_function_scale = _SOFT
+    pycolmap.bundle_adjustment(model, adjustment)
+    options = pycolmap.IncrementalPipelineOptions(
+        random_seed=0, triangulation={"ignore_two_view_tracks": False}
+    )
+    with TemporaryDirectory(dir=work) as folder:
+        return pycolmap.triangulate_points(
+            model, database, photos.folder, folder, clear_points=False, options=options
+        )
 
 
 def _measured_pairs(database: Path, models: Sequence[pycolmap.Reconstruction]) -> list[MatchedPair]:

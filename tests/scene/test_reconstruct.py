@@ -8,7 +8,7 @@ import numpy as np  # before pycolmap
 import pycolmap
 import pytest
 from PIL import Image
-from scenes import speckled, write_scene
+from scenes import CENTER, HALF_SIZES, speckled, write_scene
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import locked
@@ -71,6 +71,17 @@ def test_poses_are_those_that_the_photos_were_taken_from(reconstructed):
     degrees, distances = pose_errors(model, given)
     assert degrees.max() < 2.5
     assert distances.max() < 0.15  # of about 4 to the box
+
+
+def test_points_that_two_photos_alone_show_are_in_the_model_where_they_are(reconstructed):
+    _, model, given = reconstructed
+    found, true = pycolmap.Reconstruction(model), read_reconstruction(given).photos
+    ours = read_reconstruction(model).photos
+    align = pycolmap.estimate_sim3d(*(np.array([m[n].center for n in sorted(ours)]) for m in (ours, true)))
+    points = [align * point.xyz for point in found.points3D.values() if point.track.length() == 2]
+    assert len(points) >= found.num_points3D() / 10
+    from_side = np.abs(np.abs(points - CENTER) - HALF_SIZES).min(axis=1)
+    assert np.median(from_side) < 0.05
 
 
 def test_stronger_features_find_them_too(photos, scene, monkeypatch):
