@@ -33,7 +33,7 @@ from lang3dxl_ns.scene.companions import cache_folder, inside
 from lang3dxl_ns.scene.layout import find_model, has_model, images_folder
 from lang3dxl_ns.scene.matching import extract, feature_database, match, numbered, quiet, usable
 from lang3dxl_ns.scene.photo_folder import PhotoFolder, find_photos, shared_cameras
-from lang3dxl_ns.scene.placements import LEAST_MATCHES, doubtful_placements, matched_pairs
+from lang3dxl_ns.scene.placements import LEAST_MATCHES, SOUND, doubtful_placements, matched_pairs
 from lang3dxl_ns.scene.reconstruct import check_settings, write_picture
 from lang3dxl_ns.scene.reconstruction import (
     REPORT,
@@ -56,8 +56,6 @@ _ERROR = 0.005
 """Largest distance of a point from its pixel that agrees with a pose, relative to the longer side."""
 _TRUST = 1.1
 """How many times as many points must agree with a camera of its own as with one of the model's."""
-_SOUND = 4.0, 1.5
-"""Largest error in pixels and smallest angle in degrees of a new point, as in COLMAP's mapper."""
 _PARTS = ("cameras", "images", "points3D", "rigs", "frames")
 
 
@@ -364,7 +362,7 @@ def _triangulate(
     options = pycolmap.IncrementalTriangulatorOptions(ignore_two_view_tracks=False, random_seed=0)
     for number in added.values():
         pycolmap.IncrementalTriangulator(matches, model).triangulate_image(options, number)
-    pycolmap.ObservationManager(model, matches).filter_points3D(*_SOUND, set(model.points3D) - known)
+    pycolmap.ObservationManager(model, matches).filter_points3D(*SOUND, set(model.points3D) - known)
 
 
 def _report(

@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
 LEAST_MATCHES = 15
 """Fewest verified matches of a pair of photos that is considered, as in COLMAP's mapper."""
+SOUND = 4.0, 1.5
+"""Largest error in pixels and smallest angle in degrees of a point, as in COLMAP's mapper."""
 _ERROR = 0.004
 """Largest error in pixels of a match that agrees with a rotation, relative to the photo's longer side."""
 APART = 20.0
