@@ -12,6 +12,7 @@ import shutil
 from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -267,6 +268,12 @@ def quiet() -> Iterator[None]:
 
 
 def _digest(path: Path) -> str:
+    state = path.stat()
+    return _read_digest(path, state.st_size, state.st_mtime_ns)
+
+
+@cache  # duplicates are looked for, then features that are kept
+def _read_digest(path: Path, size: int, changed: int) -> str:
     return hashlib.blake2b(path.read_bytes(), digest_size=16).hexdigest()
 
 

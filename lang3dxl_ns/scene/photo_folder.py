@@ -84,8 +84,8 @@ def shared_cameras(photos: PhotoFolder) -> list[list[str]]:
     return found
 
 
-def walks(photos: PhotoFolder) -> list[list[str]]:
-    """List the photos that one camera took in the same hour, in the order of time, by EXIF's maker, model,
+def walks(photos: PhotoFolder) -> Iterator[list[str]]:
+    """Yield the photos that one camera took in the same hour, in the order of time, by EXIF's maker, model,
     serial number and times. Photos without a time or model are in no walk."""
     taken: dict[tuple, list[tuple[str, str]]] = {}
     for name in photos.names:
@@ -97,7 +97,7 @@ def walks(photos: PhotoFolder) -> list[list[str]]:
             camera = *body, details.get(ExifTags.Base.BodySerialNumber), time[:13]
             fraction = details.get(ExifTags.Base.SubsecTimeOriginal, "")
             taken.setdefault(camera, []).append((f"{time}.{fraction}", name))
-    return [[name for _, name in sorted(walk)] for walk in taken.values()]
+    yield from ([name for _, name in sorted(walk)] for walk in taken.values())
 
 
 def readable(photos: PhotoFolder) -> tuple[PhotoFolder, dict[str, str]]:

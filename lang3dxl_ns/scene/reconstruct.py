@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lang3dxl_ns.common.checks import check_numbers
-from lang3dxl_ns.common.console import progress, say
+from lang3dxl_ns.common.console import progress, say, tracked
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import expanded, locked, replace_file
 from lang3dxl_ns.common.options import data_option
@@ -249,7 +249,7 @@ def _map(
                 found = pycolmap.global_mapping(database, photos.folder, folder, options)
             else:
                 options = pycolmap.IncrementalPipelineOptions(
-                    min_model_size=_SMALLEST_MODEL, mapper=thresholds, **settings
+                    min_model_size=_SMALLEST_MODEL, extract_colors=False, mapper=thresholds, **settings
                 )
                 found = pycolmap.incremental_mapping(
                     database, photos.folder, folder, options, next_image_callback=advance
@@ -257,7 +257,7 @@ def _map(
         models = [m for m in found.values() if m.num_reg_images() >= _SMALLEST_MODEL and m.num_points3D()]
         if models:
             break
-    for model in models:
+    for model in tracked(models, "models completed"):
         _complete(model, database, photos)
     return sorted(models, key=lambda model: -model.num_reg_images())
 
@@ -265,7 +265,7 @@ def _map(
 def _complete(model: pycolmap.Reconstruction, database: Path, photos: PhotoFolder) -> None:
     """Adjust the cameras once more, so that false matches count less, and add the points that only two photos
     show. The mapper passes over these, since they say little about cameras. But Gaussians start from points,
-    and without them thin things are lost."""
+    and without them thin things are lost. All points are colored here."""
     pycolmap = load_pycolmap()
     adjustment, adjusted = pycolmap.BundleAdjustmentOptions(print_summary=False), model.reg_image_ids()
     adjustment.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY

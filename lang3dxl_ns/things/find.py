@@ -117,9 +117,7 @@ def things_of(scene: Answering, question: Question) -> list[Things]:
         joined = sorted(placed(parts, [boxed(part) for part in parts]), key=lambda one: -one.weight)
         seen = [one for one in without_crumbs(joined) if one.views >= VIEWS]
         sure = [one for one in seen if prompt.taught or values[one.rows].max() >= PRESENT]
-        better = (
-            better_words(scene, prompt, sure, (weight * values) ** 2) if sure and not prompt.taught else {}
-        )
+        better = {} if prompt.taught else better_words(scene, prompt, sure, (weight * values) ** 2)
         sure = [one for one in sure if one not in better]
         rest = [one for one in joined if one not in sure]
         things, candidates = (

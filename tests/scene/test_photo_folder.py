@@ -174,7 +174,7 @@ def test_a_walk_is_what_one_camera_took_in_an_hour(tmp_path):
             exif[ExifTags.Base.Model] = model
         exif.get_ifd(ExifTags.IFD.Exif).update({tag: value for tag, value in told.items() if value})
         Image.new("RGB", (8, 6)).save(tmp_path / name, exif=exif)
-    assert walks(find_photos(tmp_path)) == [
+    assert [*walks(find_photos(tmp_path))] == [
         ["y.jpg", "z.jpg", "a.jpg"],
         ["bad.jpg"],
         ["late.jpg"],
