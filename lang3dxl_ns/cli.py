@@ -35,6 +35,7 @@ BENCHMARKS = {
     "holyscenes": ("lab.benchmarks.published:HolyScenes", "HolyScenes, beside the published figures."),
     "lerf-ovs": ("lab.benchmarks.published:LerfOvs", "LERF-OVS, beside the published figures."),
     "pt-ovs": ("lab.benchmarks.published:PtOvs", "PT-OVS, scene by scene."),
+    "trust": ("lab.benchmarks.trust:TrustBenchmark", "Cautions under wrong answers, and under right ones."),
     "page": ("lab.benchmarks.page:PageBenchmark", "Seconds until the page of a scene answers."),
     "things": ("lab.benchmarks.things:ThingsBenchmark", "Single windows and towers: F1, counts, boxes."),
     "attach": ("lab.benchmarks.attach:AttachBenchmark", "Words attached to a splat, beside its run's."),

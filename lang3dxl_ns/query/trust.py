@@ -29,9 +29,9 @@ ALIKE = 0.85
 FAINT = 0.5
 """Peaks below this are doubtful: a negative fits better than the prompt even at its best places."""
 CLEARLY = 0.8
-"""Peaks from which a prompt is found (docs/lab/words.md, "Trust"). On the six validation landmarks and the
-castle, with the level that the other scenes choose, none of 29 right words has a caution, and 281 of 281
-wrong or absent ones have one. The other thresholds were chosen on these scenes."""
+"""Peaks from which a prompt is found. `lang3dxl benchmark trust` on the six validation landmarks and castle,
+with the level that the other scenes choose: none of 29 right words has a caution, and 281 of 281 wrong or
+absent ones have one. The other thresholds were chosen on these scenes."""
 STRICTER, STRICTEST = 0.15, 0.99
 """How much more a scene unlike what the CLIP was trained on has to reach, per unit of foreignness beyond
 `FAR`, and the most that is asked for."""
