@@ -2,8 +2,10 @@
 
 import json
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
+from time import perf_counter
 
 import numpy as np
 import pytest
@@ -17,7 +19,8 @@ from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.options import data_option, model_option, switched_on
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth
 from lang3dxl_ns.query.match import together
-from lang3dxl_ns.query.text import Prompt, parse_prompts
+from lang3dxl_ns.query.text import Prompt, caution, parse_prompts
+from lang3dxl_ns.things.grammar import parse
 
 
 def report(path: Path, scene: str, layout: str = "plain", scored: bool = True) -> None:
@@ -183,6 +186,16 @@ def test_python_calls_with_anything_else_name_what_was_expected(value):
 def test_long_prompts_are_parsed_in_a_moment(typed):
     """Quadratic patterns took 40 s for the first of these, whose single spaces are one."""
     assert len(parse_prompts(typed + "x")) == 1
+
+
+@pytest.mark.parametrize("part", ["?", ". ", "\N{NO-BREAK SPACE}", " on the left", " above the portal", "1"])
+def test_long_questions_are_read_or_refused_in_a_moment(part):
+    """Quadratic patterns took 60 s, and relations within relations ended in Python's RecursionError."""
+    typed, start = "the 1" + 30_000 * part + "st window from the left", perf_counter()
+    caution(typed)
+    with suppress(UserError):
+        parse(typed)
+    assert perf_counter() - start < 5
 
 
 def test_pictures_of_views_through_other_lenses_are_not_drawn_over_each_other():

@@ -14,6 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lang3dxl_ns.common.checks import expect
+from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.pictures import color_bytes
 from lang3dxl_ns.common.ply_tables import Table, read_header, read_vertices
@@ -21,6 +22,7 @@ from lang3dxl_ns.files.activations import ALL_BANDS, activated, array_of, check_
 from lang3dxl_ns.rendering import Splats, harmonics_of
 
 _NEEDED = ("x", "y", "z", "opacity", "scale_0", "scale_1", "rot_0", "rot_1", "rot_2", "rot_3")
+_COLORS, _HARMONICS = ("red", "green", "blue"), ("f_dc_0", "f_dc_1", "f_dc_2")
 _ANTIALIASED = re.compile(r"comment\s+(splatrendermode:\s*mip|antialiased:?\s*(1|true))\s*", re.IGNORECASE)
 """Comments by which programs tell that a splat was trained with antialiasing."""
 
@@ -36,7 +38,8 @@ def read_ply(path: Path) -> Splats:
             return _supersplat(path, tables)
         # CloudCompare names all columns but the coordinates so.
         known = {name.lower().removeprefix("scalar_"): name for name in names}
-        if missing := [name for name in _NEEDED if name not in known]:
+        colors = _COLORS if _COLORS[0] in known else _HARMONICS
+        if missing := [name for name in (*_NEEDED, *colors) if name not in known]:
             raise UserError(f"not a splat but a point cloud: its points have no {', '.join(missing[:3])}")
         check_memory(vertices.length, 1 + sum(name.startswith("f_rest_") for name in known) // 3)
         columns = read_vertices(file, form, tables)
@@ -51,10 +54,10 @@ def _splats_of(table: Any) -> Splats:
         return torch.from_numpy(np.stack([table[name].astype(np.float32) for name in names], axis=1))
 
     rest = sorted(filter(re.compile(r"f_rest_\d+").fullmatch, table), key=lambda name: int(name[7:]))
-    if "f_dc_0" in table:
-        first = columns("f_dc_0", "f_dc_1", "f_dc_2")[:, None]
+    if _HARMONICS[0] in table:
+        first = columns(*_HARMONICS)[:, None]
     else:
-        plain = np.stack([table[name] for name in ("red", "green", "blue")], axis=1)
+        plain = np.stack([table[name] for name in _COLORS], axis=1)
         whole = plain.dtype.kind != "f"  # 0 to 255, or 0 to 1, where each may be dark
         colors = torch.from_numpy((color_bytes(plain) if whole else plain).astype(np.float32))
         first = harmonics_of(colors / (255 if whole or (colors > 1).any() else 1))
@@ -65,9 +68,13 @@ def _splats_of(table: Any) -> Splats:
     scales = columns("scale_0", "scale_1")
     # A flat Gaussian (2D Gaussian splatting) has only two scales.
     third = columns("scale_2") if "scale_2" in table else scales.amin(1, keepdim=True) - 5
-    quats, scales = columns("rot_0", "rot_1", "rot_2", "rot_3"), torch.cat([scales, third], dim=1)
-    harmonics = torch.cat([first, others], dim=1)
-    return activated(columns("x", "y", "z"), scales, quats, columns("opacity"), harmonics)
+    quats, opacities = columns("rot_0", "rot_1", "rot_2", "rot_3"), columns("opacity")
+    # Never of logarithms and logits: all larger than a unit, and none fainter than a half.
+    if len(first) > 1 and bool((scales > 0).all() and ((opacities >= 0) & (opacities <= 1)).all()):
+        say("its sizes and opacities are not logarithms and logits, and are taken as they are")
+        scales, third, opacities = scales.log(), third.clamp_min(1e-9).log(), opacities.logit()
+    scales, harmonics = torch.cat([scales, third], dim=1), torch.cat([first, others], dim=1)
+    return activated(columns("x", "y", "z"), scales, quats, opacities, harmonics)
 
 
 def _supersplat(path: Path, tables: dict[str, Table]) -> Splats:

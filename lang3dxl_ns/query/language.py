@@ -106,7 +106,8 @@ def meaning(text: str) -> Meaning:
     if re.match(r"(The )?[A-Z]\w* [A-Z]\w*", text) and _english(text) == text:
         return Meaning(text)
     unused: list[tuple[str, str]] = []
-    target = re.sub(r"[\s?!.]+$", "", text) or text
+    text = " ".join(text.split())  # as in `held`
+    target = text.rstrip(" ?!.") or text
     asks = re.compile(rf"^(?:{_any('lead')}|{_any('count')})\s+(?=\S)", re.IGNORECASE)
     if (found := asks.match(target)) is not None:
         if re.fullmatch(rf"(?:{_any('count')})\s+", found[0], re.IGNORECASE):

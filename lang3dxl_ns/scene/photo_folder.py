@@ -38,6 +38,8 @@ _PHONE_PANORAMA = 6
 """Value that phones give to EXIF's CustomRendered."""
 _WIDEST = 3.0
 """Largest ratio of sides of a photo; stitched panoramas are wider."""
+_LEAST_SIDE = 16
+"""Shorter side of a photo in pixels, below which COLMAP's stronger features crash."""
 
 
 @dataclass(frozen=True)
@@ -110,11 +112,14 @@ def readable(photos: PhotoFolder) -> tuple[PhotoFolder, dict[str, str]]:
             continue
         try:
             with open_picture(path) as image:
+                width, height = image.size
                 image.draft("L", (100, 100))  # a JPEG is decoded to its end, in an eighth of the time
                 image.load()
                 panorama = _is_panorama(image)
             if panorama:
                 bad[name] = "a panorama, which no single lens takes: use single photos, or cut out views"
+            elif min(width, height) < _LEAST_SIDE:
+                bad[name] = f"{width} × {height} pixels are too few to match: use a larger copy"
             else:
                 good.append(name)
         except (OSError, NoPictureError) as error:

@@ -97,6 +97,7 @@ def things_of(scene: Answering, question: Question) -> list[Things]:
     mass = scene.mass.double().cpu().numpy()
     means, axes = scene.splats.means.double().cpu().numpy(), axes_of(scene)
     colors = harmonics_of(scene.baked().colors(scene.overview.camera.position).clamp(0, 1))[:, 0]
+    colors = colors.nan_to_num()  # of Gaussians that lie nowhere
     sharp = [_sharpened(scene, relevancy, colors.cpu().numpy()) for relevancy in question.relevancy]
     peak = peaks(question.relevancy).tolist()  # a word below the lowest level names nothing here
     pieces: list[list[Piece]] = [[] for _ in sharp]
@@ -107,7 +108,7 @@ def things_of(scene: Answering, question: Question) -> list[Things]:
     def box(weight: Float[Array, " n"], one: Joined) -> Box:
         return upright_box(means[one.rows], weight[one.rows], axes)
 
-    answers = list[Things]()
+    answers, shown_in = list[Things](), sum(len(view.rows) > 0 for view in scene.visible.values())
     for i, prompt in enumerate(question.prompts):
         values = question.relevancy[i].double().cpu().numpy()
         weight = np.sqrt(mass) * values
@@ -127,6 +128,8 @@ def things_of(scene: Answering, question: Question) -> list[Things]:
         caution = trust.reason if far or trust.level != "sure" else None
         if better and not things:
             caution = f"what was found fits {next(iter(better.values()))!r} better"
+        if shown_in < VIEWS:
+            caution = f"{shown_in} training photos show the scene, and things are what two or more show"
         answers.append(Things(prompt.text, things, candidates, caution))
     return answers
 

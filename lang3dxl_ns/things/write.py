@@ -80,14 +80,19 @@ def write_catalog(scene: Scene, answers: Sequence[Things], folder: Path) -> None
         seen = [{"photo": one.photo, "box": box} for one, box in zip(thing.sightings, boxes, strict=True)]
         more = {"meters": meters, "above_ground": above, "photos": seen}
         listed.append({"number": number, **thing.as_json(), **more})
-        told = number, thing.word, thing.id, round(thing.score, 3), thing.views
+        told = number, _cell(thing.word), thing.id, round(thing.score, 3), thing.views
         box = *thing.center.round(4).tolist(), *thing.size.round(4).tolist()
-        lines.writerow([*told, *box, thing.best_photo, *(meters or [""] * 3)])
+        lines.writerow([*told, *box, _cell(thing.best_photo), *(meters or [""] * 3)])
     content = {"words": words, "things": listed, "relations": graph, "heights": [ground, top]}
     content |= {"up": up.tolist(), "unit": None if place is None else asdict(place)}
     write_atomically(folder / "things.json", json.dumps(content, indent=1) + "\n")
     write_atomically(folder / "things.csv", rows.getvalue())
     write_atomically(folder / "instances.json", json.dumps(coco(scene, answers)) + "\n")
+
+
+def _cell(text: str) -> str:
+    """Quote a text of which spreadsheets would make a formula: names may be a stranger's."""
+    return f"'{text}" if text.startswith(("=", "+", "-", "@")) else text
 
 
 def _relations(things: Sequence[Thing], view: Sight) -> list[list[int | str]]:

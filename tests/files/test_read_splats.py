@@ -58,6 +58,25 @@ def write_table(path, rows, form: str, kind: str, name: str) -> None:
     path.write_bytes(header.encode() + body)
 
 
+def test_sizes_and_opacities_that_are_no_logarithms_and_logits_are_read_as_they_are(tmp_path, capsys):
+    splats = some_splats(7)
+    splats.scales[:] *= 100  # sizes in centimeters
+    write_splats(tmp_path / "a.ply", splats)
+    assert_alike(read_splats(tmp_path / "a.ply"), splats, scales=1e-4)
+    assert "as they are" not in capsys.readouterr().out
+    names, rows = table(tmp_path / "a.ply")
+    rows = rows.copy()
+    for name in (name for name in names if name.startswith("scale")):
+        rows[name] = np.exp(rows[name])
+    rows["opacity"] = 1 / (1 + np.exp(-rows["opacity"]))
+    write_table(tmp_path / "b.ply", rows, "binary_little_endian", "<f4", "float")
+    assert_alike(read_splats(tmp_path / "b.ply"), splats, scales=1e-4, colors=1e-5)
+    assert "taken as they are" in capsys.readouterr().out
+    write_table(tmp_path / "c.ply", rows[[n for n in names if n != "f_dc_1"]].copy(), "ascii", "<f4", "float")
+    with pytest.raises(UserError, match="its points have no f_dc_1"):
+        read_splats(tmp_path / "c.ply")
+
+
 def test_every_property_of_a_ply_is_in_its_place(tmp_path):
     splats, relevancy = some_splats(7), torch.linspace(0, 1, 7)
     splats.scales[2, 1] = torch.nan  # broken Gaussians stay out

@@ -8,8 +8,10 @@ from PIL import ExifTags, Image
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.scene import pairing
+from lang3dxl_ns.scene.matching import extract, feature_database
 from lang3dxl_ns.scene.pairing import pairs_that_share, pairs_to_match, similar_pairs
 from lang3dxl_ns.scene.photo_folder import find_photos, readable, shared_cameras, walks
+from lang3dxl_ns.scene.reconstruction import ReconstructionSettings
 
 
 def put(path, size=(8, 6), body=None, focal=None):
@@ -93,6 +95,16 @@ def test_panoramas_are_named_and_stereo_pictures_read(tmp_path):
     assert set(good.names) == {"wide.png", "stereo.mpo"}
     assert set(bad) == {"sweep.jpg", "sphere.jpg", "stitched.png"}
     assert all("panorama" in why for why in bad.values())
+
+
+def test_photos_that_would_crash_colmap_are_named(tmp_path):
+    for name, size in {"dot.png": (1, 1), "thumb.jpg": (45, 15), "least.png": (48, 16)}.items():
+        Image.new("RGB", size).save(tmp_path / name)
+    good, bad = readable(find_photos(tmp_path))
+    assert good.names == ("least.png",) and set(bad) == {"dot.png", "thumb.jpg"}
+    assert "45 × 15 pixels are too few" in bad["thumb.jpg"]
+    settings = ReconstructionSettings(features="dsp-sift")
+    extract(feature_database(good, good, tmp_path, settings), good, settings)  # smaller ones end the process
 
 
 def test_exif_tells_cameras_and_zooms_apart(tmp_path):

@@ -204,6 +204,22 @@ def test_what_a_word_that_hardly_fits_finds_are_candidates(monkeypatch):
     assert answer.count == "0, perhaps 0 to 2"
 
 
+@pytest.mark.parametrize("wrong", [float("nan"), 1e30])
+def test_gaussians_that_lie_nowhere_change_no_count(wrong):
+    scene = painted_scene()
+    stray = scene.splats.means.clone()
+    stray[-1] = wrong  # a wall's, far from all windows
+    (answer,) = painted_scene(splats=replace(scene.splats, means=stray)).things("windows")
+    assert answer.count == scene.things("windows")[0].count
+
+
+def test_what_fewer_than_two_photos_show_counts_nothing_and_says_so():
+    (answer,) = painted_scene(file=replace(painted_file(), photos=painted_file().photos[:1])).things(
+        "windows"
+    )
+    assert not answer.things and "1 training photos show the scene" in answer.caution
+
+
 def test_a_place_that_fits_less_than_things_do_is_a_candidate_beside_one_that_fits():
     scene = painted_scene()
     right, question = scene.splats.means[:, 0] > -1.3, scene.ask("windows")
@@ -241,10 +257,12 @@ def test_a_sample_of_the_gaussians_tells_the_colors_of_a_word(monkeypatch):
 
 def test_the_catalog_names_the_nearest_neighbors_and_what_is_in_what(tmp_path):
     scene = painted_scene()
-    row = [thing(i, "window", (x, 0, 5)) for i, x in enumerate([0, 3, 9])]
+    row = [thing(i, "=window", (x, 0, 5)) for i, x in enumerate([0, 3, 9])]
     everywhere = thing(9, "wall", (4, 0, 5), (20, 1, 10))
     view = sight_of(scene, row)
-    write_catalog(scene, [Things("window", row), Things("wall", [everywhere])], tmp_path)
+    write_catalog(scene, [Things("=window", row), Things("wall", [everywhere])], tmp_path)
+    table = [line.split(",")[1] for line in (tmp_path / "things.csv").read_text().splitlines()]
+    assert table == ["word", "'=window", "'=window", "'=window", "wall"]  # no spreadsheet's formula
     graph = json.loads((tmp_path / "things.json").read_text())["relations"]
     assert [[a, b] for a, name, b in graph if name == "in"] == [[0, 9], [1, 9], [2, 9]]
     side, other = ("left_of", "right_of") if view.right[0] > 0 else ("right_of", "left_of")
