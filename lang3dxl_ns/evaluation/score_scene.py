@@ -70,8 +70,9 @@ def score_scene(
 
 def labeled_photos(scene: Scene, truth: GroundTruth, split: SceneSplit) -> list[ScenePhoto]:
     """List the photos of a split that have labels. Raises UserError if there are none."""
-    wanted = {"held-out": ("eval",), "seen": ("train",), "all": ("train", "eval")}[split]
-    photos = [p for p in scene.photos if p.split in wanted and truth.key(p.name) is not None]
+    trained = [p for p in scene.photos if p.split == "train" and split != "held-out"]
+    held_out = [p for p in scene.photos if p.held_out and split != "seen"]
+    photos = [p for p in (*trained, *held_out) if truth.key(p.name) is not None]
     if not photos:
         raise UserError(f"no label in {truth.folder} belongs to a {split} photo of the scene")
     return photos

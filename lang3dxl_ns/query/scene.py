@@ -46,7 +46,7 @@ class Scene(Answering):
     """
 
     def __repr__(self) -> str:
-        held_out = sum(photo.split == "eval" for photo in self.photos)
+        held_out = sum(photo.held_out for photo in self.photos)
         words = f"CLIP {self.file.clip}" if self.decoder is not None else "only colors"
         return (
             f"Scene({len(self.splats):,} Gaussians, {len(self.photos)} photos ({held_out} held out) "

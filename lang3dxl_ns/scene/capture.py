@@ -24,7 +24,7 @@ from lang3dxl_ns.common.files import expanded, read_names
 from lang3dxl_ns.scene.camera import camera_to_world, view_matrix
 from lang3dxl_ns.scene.capture_settings import CaptureSettings
 from lang3dxl_ns.scene.colmap import Reconstruction, TrackedPhoto, photos_in_model, read_reconstruction
-from lang3dxl_ns.scene.companions import inside, is_inside
+from lang3dxl_ns.scene.companions import cache_folder, inside, is_inside
 from lang3dxl_ns.scene.frame import COLMAP_UP, Frame, find_frame, lost_cameras
 from lang3dxl_ns.scene.layout import (
     MODEL_FOLDERS,
@@ -40,6 +40,7 @@ from lang3dxl_ns.scene.names import listed, resolve
 from lang3dxl_ns.scene.photo import Photo, upright_in_model
 from lang3dxl_ns.scene.photo_folder import check_data, find_photos, photos_below
 from lang3dxl_ns.scene.reconstruct import reconstruct_scene
+from lang3dxl_ns.scene.reconstruction import CONTRADICTED, doubtful_photos, reasons_in_words
 from lang3dxl_ns.scene.record import SceneRecord
 from lang3dxl_ns.scene.transforms import SPLITS, TRANSFORMS, Transforms, read_transforms
 from lang3dxl_ns.scene.video import extract_frames, frames_folder, is_video
@@ -69,6 +70,8 @@ class Capture:
     """Poses of these photos, tracks, and points with colors."""
     left_out: dict[str, str] = field(default_factory=dict)
     """Photos that can't be used, with reasons."""
+    doubtful: dict[str, str] = field(default_factory=dict)
+    """Photos whose pose may be wrong, with reasons. Contradicted ones are used only if a list names them."""
     images: Path = Path()
     """Folder that the photos' names are relative to."""
     source: Path | None = None
@@ -116,10 +119,11 @@ class Capture:
         return self._of_lists(*(frozenset[str]().union(*part) or None for part in parts))
 
     def _of_lists(self, train: frozenset[str] | None, held_out: frozenset[str] | None) -> Split:
-        """Split by two lists. One that is missing holds all other photos."""
-        chosen = [n for n in self.names if (n in train if train else n not in (held_out or ()))]
-        others = [n for n in self.names if (n in held_out if held_out else n not in chosen)]
-        return Split(tuple(chosen), tuple(others))
+        """Split by two lists. One that is missing holds all other photos whose poses are not contradicted."""
+        sure = frozenset(self._sure)
+        chosen = train or sure.difference(held_out or ())
+        others = held_out or sure.difference(chosen)
+        return Split(*(tuple(n for n in self.names if n in part) for part in (chosen, others)))
 
     def _named(self, path: Path) -> frozenset[str]:
         """Read a list of photos. Raises UserError for an unknown one."""
@@ -127,10 +131,15 @@ class Capture:
             return listed(read_names(path), {*self.names, *self.left_out}, "it")
 
     def _split_by_rule(self) -> Split:
+        sure, every = self._sure, self.settings.eval_interval
         if self.settings.eval_mode == "all":
-            return Split(tuple(self.names), tuple(self.names))
-        every = self.settings.eval_interval
-        return Split(tuple(n for i, n in enumerate(self.names) if i % every), tuple(self.names[::every]))
+            return Split(tuple(sure), tuple(sure))
+        return Split(tuple(n for i, n in enumerate(sure) if i % every), tuple(sure[::every]))
+
+    @property
+    def _sure(self) -> list[str]:
+        """Photos whose poses are not contradicted."""
+        return [name for name in self.names if self.doubtful.get(name) != CONTRADICTED]
 
     @cached_property
     def frame(self) -> Frame:
@@ -198,6 +207,8 @@ def open_capture(
         capture = _of_transforms(source, settings)
     else:
         capture = _of_model(folder, source, settings)
+        doubts = doubtful_photos(cache_folder(folder, cache_dir))
+        capture = replace(capture, doubtful={n: doubts[n] for n in capture.names if n in doubts})
     if not capture.photos:
         first = next(iter(capture.left_out.items()), ("", "it lists none"))
         raise UserError(
@@ -305,7 +316,7 @@ def _usable(
         )
     photos.sort(key=lambda photo: photo.name)
     kept = dict(sorted(kept.items()))
-    return Capture(folder, photos, replace(found, photos=kept), left_out, images, settings=settings)
+    return Capture(folder, photos, replace(found, photos=kept), left_out, images=images, settings=settings)
 
 
 def _mention_what_is_not_used(capture: Capture, model: Path, listed: set[str]) -> None:
@@ -353,10 +364,13 @@ def recorded_capture(record: SceneRecord) -> Capture:
         view = view_matrix(pose)[:3].numpy()
         tracked[photo.name] = TrackedPhoto(photo.name, photo.lens, view, nothing, nothing[:, :2])
     model = Reconstruction(tracked, np.eye(4)[:, :3], np.zeros((4, 3), np.uint8))
-    held_out = tuple(photo.name for photo in record.photos if photo.split == "eval")
+    held_out = tuple(photo.name for photo in record.photos if photo.held_out)
     split = Split(tuple(record.trained), held_out or tuple(record.trained))  # no photo may be held out
     photos = [photo.photo(Path(record.data)) for photo in record.photos]
-    return Capture(Path(record.data), photos, model, known_split=split, known_frame=record.frame)
+    doubtful = {photo.name: photo.doubtful for photo in record.photos if photo.doubtful}
+    return Capture(
+        Path(record.data), photos, model, {}, doubtful, known_split=split, known_frame=record.frame
+    )
 
 
 # ── cameras that are lost ───────────────────────────────────────────────────────────────────────────────
@@ -384,3 +398,6 @@ def say_left_out(capture: Capture) -> None:
     if capture.left_out:
         say(f"{len(capture.left_out)} photos of {capture.source} are left out:")
         say(*(f"  {printable(name)}: {why}" for name, why in capture.left_out.items()))
+    used = frozenset().union(*capture.split)
+    unused = {name: why for name, why in capture.doubtful.items() if name not in used}
+    say(*reasons_in_words({"doubtfully placed, and not used": unused}))

@@ -17,6 +17,7 @@ from numpy import ndarray as Array
 from scipy.spatial.transform import Rotation
 
 from lang3dxl_ns.scene.colmap import load_pycolmap
+from lang3dxl_ns.scene.reconstruction import CONTRADICTED, LONELY
 
 if TYPE_CHECKING:
     import pycolmap
@@ -67,9 +68,9 @@ def doubtful_placements(
         if not accused:
             break
         worst = max(accused, key=accused.__getitem__)
-        reasons[worst] = "most of its matches are with photos placed elsewhere"
+        reasons[worst] = CONTRADICTED
     lonely = [p for p in rotations if p not in reasons and supporters[p] < 2 and len(rotations) > 3]
-    return reasons | dict.fromkeys(lonely, "only one other photo supports it")
+    return reasons | dict.fromkeys(lonely, LONELY)
 
 
 def matched_pairs(database: pycolmap.Database, cameras: Mapping[int, pycolmap.Camera]) -> list[MatchedPair]:

@@ -17,6 +17,12 @@ REPORT = Path("reconstruction/report.json")
 PICTURE = REPORT.with_name("cameras.png")
 """File beside the report that shows cameras and points."""
 
+CONTRADICTED, LONELY = (
+    "most of its matches are with photos placed elsewhere",
+    "only one other photo supports it",
+)
+"""Reasons to doubt a photo's place. Of the first kind half stand wrong, of the second hardly any."""
+
 
 @dataclass
 class ReconstructionSettings:
@@ -81,7 +87,8 @@ class ReconstructionReport:
         if self.doubtful:
             found.append(
                 "a building that looks alike from several sides takes photos to the wrong one: look at the "
-                "doubtful ones in the viewer, and remove those that stand wrong"
+                "doubtful ones in the viewer. Training leaves out those with matches elsewhere, unless a "
+                "train_list.txt in the scene's folder names them"
             )
         return found
 

@@ -31,6 +31,7 @@ from lang3dxl_ns.scene.companions import is_name
 from lang3dxl_ns.scene.frame import Frame
 from lang3dxl_ns.scene.georeference import Georeference, georeference, georeference_from_json, gps_position
 from lang3dxl_ns.scene.photo import Photo
+from lang3dxl_ns.scene.reconstruction import CONTRADICTED
 
 SCENE_FILE = "lang3dxl_scene.json"
 """Name of the scene description, which lies beside config.yml."""
@@ -77,8 +78,13 @@ class ScenePhoto:
 
     def __repr__(self) -> str:
         width, height = self.file_size
-        held_out = ", held out" if self.split == "eval" else ""
+        held_out = ", held out" if self.held_out else ""
         return f"ScenePhoto({self.name!r}, {width} × {height} pixels{held_out})"
+
+    @property
+    def held_out(self) -> bool:
+        """Whether training did without the photo to be judged by it, not because its pose is contradicted."""
+        return self.split == "eval" and self.doubtful != CONTRADICTED
 
     @property
     def file_size(self) -> tuple[int, int]:

@@ -31,7 +31,6 @@ from lang3dxl_ns.preparation.targets import Batch, SceneFacts, TargetReader
 from lang3dxl_ns.preparation.working_photos import WorkingPhotos
 from lang3dxl_ns.scene.capture import Capture
 from lang3dxl_ns.scene.photo import Photo
-from lang3dxl_ns.scene.reconstruction import doubtful_photos
 from lang3dxl_ns.scene.record import ScenePhoto, SceneRecord
 from lang3dxl_ns.training.state import PhotoCamera, Training
 
@@ -116,7 +115,7 @@ class TrainingData:
 
     @cached_property
     def as_read(self) -> list[Photo]:
-        """Photos of both splits, training photos first, without foreground masks."""
+        """Photos of both splits, training photos first, and doubtful ones, without foreground masks."""
         side = self.config.longer_side
         known = {photo.name: photo.at_most(side) for photo in self.capture.photos}
         large = sum(max(photo.width, photo.height) > side for photo in self.capture.photos)
@@ -126,7 +125,7 @@ class TrainingData:
                 f"({data_option('longer-side')})"
             )
         train, held_out = self.capture.split
-        return [known[name] for name in dict.fromkeys((*train, *held_out))]
+        return [known[name] for name in dict.fromkeys((*train, *held_out, *self.capture.doubtful))]
 
     @cached_property
     def photos(self) -> dict[str, Photo]:
@@ -200,7 +199,7 @@ class TrainingData:
     def record(self, run: Training | None = None) -> SceneRecord:
         """Describe photos, CLIP and cameras, as the run refined them, for a scene file."""
         known = None if self.config.clip == "none" else find_model(self.config.clip, CLIP_OPTION)
-        described, doubts = [], doubtful_photos(self.cache_dir)
+        described, doubts = [], self.capture.doubtful
         for name, view in self.views.items():
             pose = view.pose if run is None else run.pose(view)
             split: Literal["train", "eval"] = "eval" if view.photo is None else "train"

@@ -1,6 +1,7 @@
 """Captures as other programs leave them: each right value, from formulas."""
 
 import base64
+import json
 import struct
 import zlib
 
@@ -12,13 +13,16 @@ from scipy.spatial.transform import Rotation
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.pictures import mask_values, open_picture
-from lang3dxl_ns.scene.capture import CaptureSettings, open_capture
+from lang3dxl_ns.preparation.settings import PreparationConfig
+from lang3dxl_ns.scene.capture import CaptureSettings, open_capture, recorded_capture
 from lang3dxl_ns.scene.colmap import read_reconstruction
 from lang3dxl_ns.scene.frame import Frame, find_frame, lost_cameras
 from lang3dxl_ns.scene.matching import numbered
 from lang3dxl_ns.scene.names import name_finder, resolve
 from lang3dxl_ns.scene.photo_folder import find_photos, readable
 from lang3dxl_ns.scene.ply_points import read_ply_points
+from lang3dxl_ns.scene.reconstruction import CONTRADICTED, LONELY, REPORT
+from lang3dxl_ns.training.batches import TrainingData
 
 HEIC = (
     b"c-muNV30{GsVvAy%}izhg51nBLl8SRGck>Uf$?~5YDppk1Sn>t<P<^K3<a6VB@Af5Br_);Y>0~k0}}%yh{gCCLIXhqPz(r|v"
@@ -521,3 +525,32 @@ def test_lists_of_a_folder_split_its_photos(folder):
     (folder / "train_list.txt").write_text("photo_001.png\nphoto_002.png\n")
     (folder / "test_list.txt").write_text("photo_003.png\n")
     assert open_capture(folder).split == (("photo_001.png", "photo_002.png"), ("photo_003.png",))
+
+
+def test_contradicted_photos_are_recorded_and_used_only_if_a_list_trains_on_them(folder, tmp_path):
+    """The scene that training records has their cameras, and is split alike when it is opened again."""
+    report = folder / "lang3dxl_cache" / REPORT
+    report.parent.mkdir(parents=True)
+    report.write_text(
+        json.dumps(
+            {
+                "doubtful": {
+                    "photo_000.png": CONTRADICTED,
+                    "photo_003.png": CONTRADICTED,
+                    "photo_004.png": LONELY,
+                    "gone": LONELY,
+                }
+            }
+        )
+    )
+    capture = open_capture(folder)
+    train, held_out = capture.split
+    assert held_out == ("photo_001.png",) and train == ("photo_002.png", "photo_004.png", "photo_005.png")
+    data = TrainingData(capture, PreparationConfig(clip="none"), tmp_path, "cpu", targets_in_steps=False)
+    record = data.record()
+    assert {photo.name: photo.doubtful for photo in record.photos if photo.doubtful} == capture.doubtful
+    assert sorted(photo.name for photo in record.photos) == capture.names
+    assert recorded_capture(record).split == capture.split
+    (folder / "train_list.txt").write_text("photo_002.png\nphoto_003.png\n")
+    listed = open_capture(folder).split
+    assert listed == (("photo_002.png", "photo_003.png"), ("photo_001.png", "photo_004.png", "photo_005.png"))
