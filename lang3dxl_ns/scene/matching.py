@@ -9,9 +9,10 @@ import hashlib
 import json
 import os
 import shutil
+import sqlite3
 from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -41,6 +42,13 @@ _ENDINGS = {"JPEG": ".jpg", "MPO": ".jpg", "PNG": ".png", "TIFF": ".tif", "BMP":
 _QUALITY = 98
 _CHUNK_PHOTOS, _CHUNK_PAIRS, _CHUNK_LEARNED = 8, 100, 5  # a step of the bar, which a killed process loses
 _STAMP = "photos.json"
+_TABLES = {
+    "keypoints": ("2, 4, 6", 4),
+    "descriptors": ("128", 1),
+    "matches": ("2", 4),
+    "two_view_geometries": ("2", 4),
+}
+"""Possible columns of the database's tables, and bytes per value."""
 
 
 def usable(photos: PhotoFolder) -> tuple[PhotoFolder, dict[str, str]]:
@@ -98,7 +106,9 @@ def feature_database(
     stamp = json.dumps({"photos": told, "features": made, "one_camera": settings.one_camera})
     database, stamped = work / "database.db", work / _STAMP
     if database.is_file() and stamped.is_file() and stamped.read_text() == stamp:
-        return database
+        if _whole(database):
+            return database
+        say(f"{database} is damaged: features and matches are made anew")
     importing = work / "importing.db"
     for old in work.glob("importing.db*"):
         old.unlink()
@@ -128,7 +138,7 @@ def _keep_features(folder: Path, database: Path, wanted: dict[str, str], made: S
     with suppress(*DAMAGE), open_database(database) as new:
         told = read_json(folder / _STAMP)
         known = {content: name for *_, content, name in told["photos"]}
-        if told["features"] != made or "xfeat" in made or not (folder / "database.db").is_file():
+        if told["features"] != made or "xfeat" in made or not _whole(folder / "database.db"):
             return
         with open_database(folder / "database.db") as old:
             for content in known.keys() & wanted:
@@ -138,6 +148,20 @@ def _keep_features(folder: Path, database: Path, wanted: dict[str, str], made: S
                     new.write_descriptors(target, old.read_descriptors(source))
                     new.write_keypoints(target, old.read_keypoints(source))  # last: `extract` looks for them
                     del wanted[content]
+
+
+def _whole(database: Path) -> bool:
+    """Return whether a database is there and undamaged: COLMAP's library trusts the sizes that it tells."""
+    if not database.is_file():
+        return False
+    address = f"{database.absolute().as_uri()}?mode=ro"
+    with suppress(sqlite3.DatabaseError), closing(sqlite3.connect(address, uri=True)) as db:
+        for table, (columns, size) in _TABLES.items():
+            wrong = f"rows * cols * {size} is not length(data) or cols not in ({columns})"
+            if db.execute(f"select 1 from {table} where rows and ({wrong})").fetchone():
+                return False
+        return db.execute("pragma quick_check(1)").fetchone() == ("ok",)
+    return False
 
 
 def extract(database: Path, photos: PhotoFolder, settings: ReconstructionSettings) -> None:

@@ -219,11 +219,25 @@ def test_photos_that_were_added_keep_their_features_for_the_next(scene, extracte
     assert extracted == [6]
 
 
-def test_a_damaged_database_of_features_is_as_good_as_none(scene, extracted):
-    database = scene / "data/lang3dxl_cache/reconstruction/database.db"
-    for path in database.parent.glob("database.db*"):
-        path.unlink()
-    database.write_bytes(b"no database" * 1000)
+@pytest.mark.parametrize(
+    "lie",
+    [
+        None,
+        "drop table matches",
+        "update descriptors set rows = 1000000000",
+        "update keypoints set cols = 3, rows = 2 * rows",
+    ],
+)
+def test_a_damaged_database_of_features_is_as_good_as_none(scene, extracted, lie):
+    """Of sizes that lie, COLMAP's library would read as many bytes."""
+    work = scene / "data/lang3dxl_cache/reconstruction"
+    if lie is None:
+        for path in work.glob("database.db*"):
+            path.unlink()
+        (work / "database.db").write_bytes(b"no database" * 1000)
+    else:
+        with closing(sqlite3.connect(work / "database.db")) as db, db:
+            db.execute(lie)
     add_photos(scene / "data", scene / "late", None, SIFT)
     assert extracted == [0, 1, 2, 3, 4, 5, 6]
 
