@@ -25,7 +25,7 @@ from lang3dxl_ns.scene.camera import camera_to_world, view_matrix
 from lang3dxl_ns.scene.capture_settings import CaptureSettings
 from lang3dxl_ns.scene.colmap import Reconstruction, TrackedPhoto, photos_in_model, read_reconstruction
 from lang3dxl_ns.scene.companions import cache_folder, inside, is_inside
-from lang3dxl_ns.scene.frame import COLMAP_UP, Frame, find_frame, lost_cameras
+from lang3dxl_ns.scene.frame import COLMAP_UP, Frame, find_frame, lost_cameras, no_scene
 from lang3dxl_ns.scene.layout import (
     MODEL_FOLDERS,
     find_model,
@@ -215,7 +215,11 @@ def open_capture(
             f"none of the {len(capture.left_out)} photos of {folder} can be used; the first: "
             f"{': '.join(first)}. Put them into images/ there (ns-train: or lang3dxl-colmap --images-path)"
         )
-    return _without_lost_cameras(capture)
+    capture = _without_lost_cameras(capture)
+    centers = np.array([tracked.center for tracked in capture.reconstruction.photos.values()])
+    if why := no_scene(centers, capture.reconstruction.points):
+        say(f"{source}: {why}. No scene comes of it: give the poses that the photos were taken from")
+    return capture
 
 
 def find_source(

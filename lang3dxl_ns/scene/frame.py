@@ -16,6 +16,8 @@ _LOST = 100
 """Distance, relative to the typical one, from which a camera is lost: it sees the scene in ten pixels."""
 _MOST_LOST = 1 / 4
 """Largest share of cameras that can be lost. Where more stand apart, they are another part of the scene."""
+_LEAST_ANGLE = 1e-3
+"""Extent of all points, relative to their distance, below which they are a pixel of every photo."""
 _PARALLEL = 0.17
 """Deviation of the cameras' right axes from a plane's normal (10 degrees) below which they are parallel."""
 
@@ -90,6 +92,18 @@ def lost_cameras(centers: Float[Array, "n 3"], points: Float[Array, "m 3"]) -> B
     lost = distances > _LOST * extent
     few = len(centers) >= 4 and lost.sum() <= _MOST_LOST * len(centers)
     return lost if few and extent > 0 else np.zeros_like(lost)
+
+
+def no_scene(centers: Float[Array, "n 3"], points: Float[Array, "m 3"]) -> str | None:
+    """Tell why cameras and points can't be those of a scene; None if they can."""
+    if len(centers) > 1 and not _apart(centers, points):
+        return "all cameras stand in one place, from where photos show no depth"
+    if len(points) > 1:
+        middle = np.median(points, axis=0)
+        far, wide = (np.median(np.linalg.norm(some - middle, axis=1)) for some in (centers, points))
+        if wide < _LEAST_ANGLE * far:
+            return f"the points lie {wide:.2g} units apart, {far:.2g} from the cameras, as in other units"
+    return None
 
 
 def _apart(centers: Float[Array, "n 3"], points: Float[Array, "m 3"]) -> bool:

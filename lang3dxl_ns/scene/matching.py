@@ -42,13 +42,8 @@ _ENDINGS = {"JPEG": ".jpg", "MPO": ".jpg", "PNG": ".png", "TIFF": ".tif", "BMP":
 _QUALITY = 98
 _CHUNK_PHOTOS, _CHUNK_PAIRS, _CHUNK_LEARNED = 8, 100, 5  # a step of the bar, which a killed process loses
 _STAMP = "photos.json"
-_TABLES = {
-    "keypoints": ("2, 4, 6", 4),
-    "descriptors": ("128", 1),
-    "matches": ("2", 4),
-    "two_view_geometries": ("2", 4),
-}
-"""Possible columns of the database's tables, and bytes per value."""
+_TABLES = {"keypoints": 4, "descriptors": 1, "matches": 4, "two_view_geometries": 4}
+"""Bytes per value in the database's tables of matrices."""
 
 
 def usable(photos: PhotoFolder) -> tuple[PhotoFolder, dict[str, str]]:
@@ -156,8 +151,8 @@ def _whole(database: Path) -> bool:
         return False
     address = f"{database.absolute().as_uri()}?mode=ro"
     with suppress(sqlite3.DatabaseError), closing(sqlite3.connect(address, uri=True)) as db:
-        for table, (columns, size) in _TABLES.items():
-            wrong = f"rows * cols * {size} is not length(data) or cols not in ({columns})"
+        for table, size in _TABLES.items():
+            wrong = f"rows * cols * {size} is not length(data) or cols not in (2, 4, 6, 128)"
             if db.execute(f"select 1 from {table} where rows and ({wrong})").fetchone():
                 return False
         return db.execute("pragma quick_check(1)").fetchone() == ("ok",)

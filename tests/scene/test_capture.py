@@ -489,6 +489,28 @@ def test_lost_cameras_are_told_and_change_nothing(times, lost):
     assert lost_cameras(centers, np.zeros((0, 3))).tolist() == [True] * lost + [False] * (10 - lost)
 
 
+@pytest.mark.parametrize(
+    ("times", "moved", "told"),
+    [(1, 1, None), (0, 1, "in one place"), (1, 1e5, "in other units"), (1, 20, None)],
+)
+def test_cameras_and_points_of_no_scene_are_told(folder, capsys, times, moved, told):
+    """Photos from one place, or points in other units than the cameras: both were trained without a word."""
+
+    def line(text):
+        name = text.split()
+        if not text.endswith(".png"):
+            return text
+        turn = Rotation.from_quat(np.array(name[1:5], float)[[1, 2, 3, 0]])
+        center = -turn.inv().apply(np.array(name[5:8], float))
+        place = -turn.apply(moved * (times * center + (1 - times) * np.array([5.0, 0, 0])))
+        return " ".join([*name[:5], *map(repr, place.tolist()), *name[8:]])
+
+    as_text(folder, images=lambda lines: [line(one) for one in lines])
+    open_capture(folder)
+    said = capsys.readouterr().out
+    assert (told in said) if told else "No scene comes of it" not in said
+
+
 @pytest.mark.parametrize("times", [1, 10, 50])
 def test_far_cameras_are_not_lost(times):
     centers = random_poses(10)[:, :, 3]
