@@ -85,6 +85,16 @@ def _plural(word: str) -> str:
     return f"{word[:-1]}ies" if word.endswith("y") and word[-2] not in "aeiou" else f"{word}s"
 
 
+@cache
+def _plurals() -> dict[str, str]:
+    return {_plural(word): word for word in shipped_vocabulary()}
+
+
+def singular(text: str) -> str:
+    """Return the common word that a text searches for in the plural; any other text as it is."""
+    return _plurals().get(searched(text).lower(), text)
+
+
 def whole_words(clip: str | Path) -> tuple[str, ...]:
     """List the lower-case words of three letters or more that a CLIP's tokenizer has as single tokens. Raises
     UserError if there is no CLIP of this name or folder on this machine."""

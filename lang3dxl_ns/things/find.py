@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
@@ -20,7 +20,7 @@ from lang3dxl_ns.query.negatives import singulars
 from lang3dxl_ns.query.question import Question
 from lang3dxl_ns.query.text import Prompt
 from lang3dxl_ns.query.trust import FAR
-from lang3dxl_ns.query.vocabulary import searched, shipped_vocabulary
+from lang3dxl_ns.query.vocabulary import searched, shipped_vocabulary, singular
 from lang3dxl_ns.rendering import composite, harmonics_of
 from lang3dxl_ns.scene.camera import in_camera_frame
 from lang3dxl_ns.things.join import VIEWS, Joined, grown, join, parted, placed, without_crumbs
@@ -94,6 +94,7 @@ def things_of(scene: Answering, question: Question) -> list[Things]:
     where they share Gaussians (`join`). Where a prompt's colors (in the page's light) differ from the others,
     they separate neighbors: the wall between two windows that CLIP sees as one.
     """
+    question = _in_singular(scene, question)
     mass = scene.mass.double().cpu().numpy()
     means, axes = scene.splats.means.double().cpu().numpy(), axes_of(scene)
     colors = harmonics_of(scene.baked().colors(scene.overview.camera.position).clamp(0, 1))[:, 0]
@@ -132,6 +133,19 @@ def things_of(scene: Answering, question: Question) -> list[Things]:
             caution = f"{shown_in} training photos show the scene, and things are what two or more show"
         answers.append(Things(prompt.text, things, candidates, caution))
     return answers
+
+
+def _in_singular(scene: Answering, question: Question) -> Question:
+    """Return the question with relevancies to nouns in the singular, since each thing is one: *towers* also
+    fits what is a part of some. So *tower* and *towers* find the same."""
+    prompts = [
+        prompt if prompt.taught or prompt.vector is not None else replace(prompt, text=singular(prompt.text))
+        for prompt in question.prompts
+    ]
+    if prompts == [*question.prompts]:
+        return question
+    own = scene.engine.of_gaussians(scene.queries(prompts))
+    return replace(question, everywhere=torch.cat([own, question.everywhere[len(prompts) :]]))
 
 
 def better_words(

@@ -36,6 +36,12 @@ export class Answers {
     return best;
   }
 
+  /** Set relevancies outside the foreground to 0. */
+  confined(relevancy) {
+    const { foreground } = this;
+    return foreground ? relevancy.map((value, i) => value * foreground[i]) : relevancy;
+  }
+
   /** Return peak, doubt, threshold, and the number of Gaussians of the foreground that match.
    * strict: whether the prompt has negatives of its own, or was taught; doubt: of a word that was taught;
    * name: the prompt, for comparing it with common words. */
@@ -50,8 +56,7 @@ export class Answers {
     const low = sorted[(count - 1) >> 1]; // the lower median, as in torch
     const isDoubtful = doubt > mostDoubt;
     const own = isDoubtful || strict ? rules.even : Math.min(low + rules.share * (fit - low), rules.even);
-    const level = threshold ?? own, { foreground } = this;
-    const confined = foreground ? relevancy.map((value, i) => value * foreground[i]) : relevancy;
+    const level = threshold ?? own, confined = this.confined(relevancy);
     let matching = 0, peak = 0;
     for (const value of confined) (peak = Math.max(peak, value)), (matching += value > level);
     const alike = taught || name === null ? [] : this.alike(name, relevancy, own);

@@ -21,7 +21,7 @@ export class List extends EventTarget {
   /** Find a prompt's things, once for each of its answers; resolves to { things, candidates }. */
   async find(prompt) {
     const { turn, relevancy } = prompt;
-    if (prompt.counting?.turn !== turn) prompt.counting = { turn, found: this.think("things", { text: prompt.text, relevancy, taught: Boolean(prompt.taught || prompt.examples) }) };
+    if (prompt.counting?.turn !== turn) prompt.counting = { turn, found: this.think("things", { text: prompt.text, negatives: prompt.negatives, relevancy, taught: Boolean(prompt.taught || prompt.examples) }) };
     const found = await prompt.counting.found;
     if (prompt.turn !== turn || prompt.found === found) return found;
     prompt.found = found;

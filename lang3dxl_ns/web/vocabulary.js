@@ -120,6 +120,12 @@ export class Vocabulary {
     return forms.map((form) => this.index.get(form.toLowerCase())).find((place) => place !== undefined);
   }
 
+  /** Find the place of the common word that a phrase searches for in the plural, as Python's `singular`; -1 for others. */
+  singular(text) {
+    const target = meaning(text).target.toLowerCase();
+    return this.words.slice(0, this.common).findIndex((word) => pluralOf(word) === target);
+  }
+
   /** List the places of the common words that a prompt has, in singular or plural: *dark windows* has *window*. */
   commonIn(text) {
     const { target } = meaning(text), forms = target.toLowerCase().split(" ").flatMap((word) => [word, ...["s", "es"].map((end) => word.replace(new RegExp(`${end}$`), ""))]);
@@ -152,6 +158,11 @@ export class Vocabulary {
   get listed() {
     return [...new Set([...Object.keys(this.taught).map((i) => this.words[i]), ...this.words])];
   }
+}
+
+function pluralOf(word) {
+  if (/(s|x|ch|sh)$/.test(word)) return `${word}es`;
+  return /[^aeiou]y$/.test(word) ? `${word.slice(0, -1)}ies` : `${word}s`;
 }
 
 const pairsOf = (text) => new Set([...` ${text}`].map((_, i) => ` ${text} `.slice(i, i + 2)));

@@ -129,9 +129,14 @@ const jobs = {
   },
 
   /** Find the single things of an answer: see thingsOf. */
-  async things({ text, relevancy, taught }) {
+  async things({ text, negatives, relevancy, taught }) {
+    const [prompt, ...others] = taught ? [null] : (await understood([text, ...negatives])).found, single = taught ? -1 : vocabulary.singular(text);
+    if (single >= 0) {
+      const word = { ...vocabulary.word(single), taught: undefined }; // a thing is one, as in Python's things/find.py
+      relevancy = answers.confined(answers.relevancy(word, others.map(({ own }) => own)));
+    }
     if (!isThere(relevancy, about.words.rules)) return { things: [], candidates: [] };
-    const prompt = taught ? null : (await understood([text])).found[0], better = (weighted) => prompt && answers.better(weighted, prompt);
+    const better = (weighted) => prompt && answers.better(weighted, prompt);
     const found = thingsOf(views, { ...geometry, mass, gap: about.words.gap, edges: about.edges, antialiased: about.antialiased }, relevancy, taught, better);
     const placed = (thing) => ({ ...thing, center: inWorld(thing.center) });
     return { ...found, things: found.things.map(placed), candidates: found.candidates.map(placed) };

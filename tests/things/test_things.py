@@ -10,9 +10,11 @@ import numpy as np
 import pytest
 import torch
 from made_things import thing
-from painted_scene import WINDOWS, painted_file, painted_scene
+from painted_scene import WINDOWS, encode_texts, painted_file, painted_scene
 
+from lang3dxl_ns.query.text import Prompt
 from lang3dxl_ns.query.trust import FAR
+from lang3dxl_ns.query.vocabulary import singular
 from lang3dxl_ns.rendering import Camera, Rendering, Splats
 from lang3dxl_ns.scene.camera import in_camera_frame
 from lang3dxl_ns.scene.georeference import Georeference
@@ -172,7 +174,7 @@ def test_a_thing_keeps_its_id_in_later_questions_and_under_other_words():
 def test_what_was_asked_before_changes_no_id(monkeypatch):
     monkeypatch.setattr("lang3dxl_ns.things.find.COLORED", 10**9)
     scene, fresh = painted_scene(), painted_scene()
-    asked, wider = scene.ask("windows"), scene.ask("windows")
+    asked, wider = scene.ask("window"), scene.ask("window")
     match = scene.splats.means[asked.relevancy[0] > 0.9]
     near = torch.cdist(scene.splats.means, match).min(1).values
     edge = (near > 0) & (near < 0.2)
@@ -190,7 +192,7 @@ def test_what_was_asked_before_changes_no_id(monkeypatch):
 
 def test_the_heavier_thing_comes_first():
     scene = painted_scene()
-    x, question = scene.splats.means[:, 0], scene.ask("windows")
+    x, question = scene.splats.means[:, 0], scene.ask("window")
     plain = question.relevancy
     for half, first in ((x > -0.8, 0), (x < -1.8, 1)):  # a half of the right window, or of the left one
         question.__dict__["relevancy"] = torch.where(half, 0.0, plain)
@@ -222,7 +224,7 @@ def test_what_fewer_than_two_photos_show_counts_nothing_and_says_so():
 
 def test_a_place_that_fits_less_than_things_do_is_a_candidate_beside_one_that_fits():
     scene = painted_scene()
-    right, question = scene.splats.means[:, 0] > -1.3, scene.ask("windows")
+    right, question = scene.splats.means[:, 0] > -1.3, scene.ask("window")
     plain = question.relevancy / question.relevancy.max()
     for share, counts in ((1.0, (2, 0)), (0.95 * PRESENT, (1, 1))):
         question.__dict__["relevancy"] = torch.where(right, share * plain, plain)
@@ -230,10 +232,10 @@ def test_a_place_that_fits_less_than_things_do_is_a_candidate_beside_one_that_fi
         assert (len(found.things), len(found.candidates)) == counts
 
 
-@pytest.mark.parametrize(("text", "count"), [("minarets", 0), ("windows", 2), ("rose windows", 2)])
+@pytest.mark.parametrize(("text", "count"), [("minaret", 0), ("window", 2), ("rose window", 2)])
 def test_what_another_word_explains_better_is_a_candidate_and_its_word_says_so(text, count):
     scene = painted_scene()
-    question, windows = scene.ask(text), scene.ask("windows")
+    question, windows = scene.ask(text), scene.ask("window")
     question.__dict__["relevancy"] = windows.relevancy  # such as by a synonym
     (found,) = things_of(scene, question)
     assert (len(found.things), len(found.candidates)) == (count, 2 - count)
@@ -434,3 +436,22 @@ def test_counts_are_doubtful_where_the_answer_or_the_scene_is():
     assert caution(1.0) is None
     assert "as far from what its CLIP was trained on" in caution(FAR)
     assert caution(1.0, "nothing of the kind") is not None
+
+
+def test_a_word_finds_the_same_things_in_singular_and_plural():
+    """Although CLIP takes the plural for something else."""
+    scene = painted_scene(
+        encode_texts=lambda texts: encode_texts(["sky" if t == "windows" else t for t in texts])
+    )
+    one, many, both = scene.things(["window", "windows", Prompt("how many windows")])
+    assert one.things and [thing.id for thing in one.things] == [thing.id for thing in many.things]
+    assert (many.word, many.count, both.count) == ("windows", one.count, one.count)
+    assert [singular(text) for text in ("arches", "belfries", "rose windows", "glass", "gargoyls")] == [
+        "arch", "belfry", "rose window", "glass", "gargoyls"
+    ]  # fmt: skip
+
+
+def test_negatives_and_the_foreground_count_in_the_singular_too():
+    scene, wall = painted_scene(), Prompt("windows", negatives=("window",))
+    assert not scene.things([wall])[0].things
+    assert not things_of(scene, scene.ask("windows", foreground="sky"))[0].things

@@ -14,7 +14,7 @@ from painted_scene import painted_scene
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.query.text import Prompt
 from lang3dxl_ns.query.trust import FAR
-from lang3dxl_ns.query.vocabulary import common_words, searched, shipped_vocabulary
+from lang3dxl_ns.query.vocabulary import common_words, searched, shipped_vocabulary, singular
 from lang3dxl_ns.rendering import Camera, Splats, composite
 from lang3dxl_ns.scene.camera import in_camera_frame
 from lang3dxl_ns.things.find import Things, better_words
@@ -340,6 +340,26 @@ def test_things_join_with_those_on_or_around_them_as_in_python(page, least, most
     }
     body = "return m.placed(given.parts, given.boxes).map(({ rows }) => rows.toSorted((a, b) => a - b));"
     assert sorted(module(page, "things", body, given)) == expected
+
+
+def test_a_plural_is_one_thing_of_pythons(page):
+    texts = [
+        "windows",
+        "Arches",
+        "how many belfries",
+        "rose windows",
+        "glass",
+        "window",
+        "gargoyls",
+        "windows on the left",
+    ]
+    texts += [f"{word}s" for word in shipped_vocabulary()]
+    body = """const { Vocabulary } = await import("./vocabulary.js"), { words, texts } = given;
+      const vocabulary = Object.create(Vocabulary.prototype);
+      Object.assign(vocabulary, { words: [...words, "gargoyl"], common: words.length });
+      return texts.map((text) => words[vocabulary.singular(text)] ?? text);"""
+    given = {"words": shipped_vocabulary(), "texts": texts}
+    assert module(page, "answer", body, given) == [singular(text) for text in texts]
 
 
 def test_a_word_that_hardly_fits_names_nothing_as_in_python(page):
