@@ -245,8 +245,9 @@ def find_source(
     if may_reconstruct and find_photos(folder).names:
         mention_other_cameras(folder)
         return reconstruct_scene(folder, cache_dir)
-    if may_reconstruct and not any(folder.iterdir()):
-        raise UserError(f"{folder} is empty: give the folder with your photos")
+    if may_reconstruct and not any(map(any, map(folder.rglob, ("images.[bt]*", "cameras.[bt]*")))):
+        lacks = "holds no photos and no COLMAP model" if any(folder.iterdir()) else "is empty"
+        raise UserError(f"{folder} {lacks}: give the folder with your photos (then lang3dxl reconstruct)")
     return folder, folder / MODEL_FOLDERS[0]  # reading it tells what is missing
 
 

@@ -97,8 +97,7 @@ def things_of(scene: Answering, question: Question) -> list[Things]:
     question = _in_singular(scene, question)
     mass = scene.mass.double().cpu().numpy()
     means, axes = scene.splats.means.double().cpu().numpy(), axes_of(scene)
-    colors = harmonics_of(scene.baked().colors(scene.overview.camera.position).clamp(0, 1))[:, 0]
-    colors = colors.nan_to_num()  # of Gaussians that lie nowhere
+    colors = harmonics_of(scene.baked().colors(scene.overview.camera.position).clamp(0, 1))[:, 0].nan_to_num()
     sharp = [_sharpened(scene, relevancy, colors.cpu().numpy()) for relevancy in question.relevancy]
     peak = peaks(question.relevancy).tolist()  # a word below the lowest level names nothing here
     pieces: list[list[Piece]] = [[] for _ in sharp]

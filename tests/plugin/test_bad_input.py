@@ -47,7 +47,7 @@ def test_neither_colmap_model_nor_photos(start, folder):
     with pytest.raises(UserError, match="is empty: give the folder with your photos"):
         start(folder)
     (folder / "notes.txt").write_text("no photo")
-    with pytest.raises(UserError, match=r"no COLMAP model.*lang3dxl reconstruct"):
+    with pytest.raises(UserError, match=r"holds no photos and no COLMAP model.*lang3dxl reconstruct"):
         start(folder)
 
 
