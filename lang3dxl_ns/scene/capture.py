@@ -403,6 +403,6 @@ def say_left_out(capture: Capture) -> None:
     if capture.left_out:
         say(f"{len(capture.left_out)} photos of {capture.source} are left out:")
         say(*(f"  {printable(name)}: {why}" for name, why in capture.left_out.items()))
-    used = frozenset().union(*capture.split)
+    used = frozenset().union(*(capture.split if capture.doubtful else ()))  # an empty part is an error
     unused = {name: why for name, why in capture.doubtful.items() if name not in used}
     say(*reasons_in_words({"doubtfully placed, and not used": unused}))
