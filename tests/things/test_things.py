@@ -207,11 +207,14 @@ def test_what_a_word_that_hardly_fits_finds_are_candidates(monkeypatch):
 
 
 @pytest.mark.parametrize("wrong", [float("nan"), 1e30])
-def test_gaussians_that_lie_nowhere_change_no_count(wrong):
+def test_gaussians_that_lie_nowhere_change_no_count(wrong, monkeypatch):
+    monkeypatch.setattr("lang3dxl_ns.things.find.COLORED", 10)
     scene = painted_scene()
     stray = scene.splats.means.clone()
-    stray[-1] = wrong  # a wall's, far from all windows
-    (answer,) = painted_scene(splats=replace(scene.splats, means=stray)).things("windows")
+    stray[-1] = wrong  # a wall's, far from all windows, whose color depends on the direction that it lacks
+    colors = torch.nn.functional.pad(scene.splats.harmonics, (0, 0, 0, 3))
+    splats = replace(scene.splats, means=stray, harmonics=colors)
+    (answer,) = painted_scene(splats=splats).things("windows")
     assert answer.count == scene.things("windows")[0].count
 
 
