@@ -25,6 +25,7 @@ from lang3dxl_ns.files.activations import check_memory, tensor_of
 from lang3dxl_ns.files.checkpoints import read_checkpoint
 from lang3dxl_ns.files.glb import read_glb
 from lang3dxl_ns.files.ply import read_ply
+from lang3dxl_ns.files.scene_file import SUFFIX
 from lang3dxl_ns.files.sog import read_sog
 from lang3dxl_ns.files.spz import read_spz
 from lang3dxl_ns.rendering import Splats, harmonics_of
@@ -58,6 +59,10 @@ def read_splats(path: str | Path) -> Splats:
     large for this machine or of another kind, or most of its values are not finite."""
     path = find_splats(path)
     reader = _READERS.get(path.suffix.lower())
+    if path.suffix == SUFFIX:
+        raise UserError(
+            f"{path.name} is a scene already: ask it, or give a splat that `lang3dxl export` wrote"
+        )
     if reader is None:
         raise UserError(
             f"{path.name} has an unsupported format: give {KINDS}; SuperSplat makes a .ply of others"

@@ -610,3 +610,10 @@ def test_a_refusal_names_version_degree_type_or_column(name, content, said, tmp_
     with pytest.raises(UserError, match=said) as error:
         read_splats(tmp_path / name)
     assert "damaged" not in str(error.value)
+
+
+def test_a_scene_is_told_from_unknown_formats(tmp_path):
+    for name, told in (("a.scene", "a scene already"), ("a.usd", "unsupported format")):
+        (tmp_path / name).write_bytes(b"PK")
+        with pytest.raises(UserError, match=told):
+            read_splats(tmp_path / name)
