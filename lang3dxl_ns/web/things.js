@@ -8,11 +8,14 @@ import { seenAt } from "./space.js";
 
 const { LEVELS, LEAST, PART, DEPTH, FILLED, SHARED, SPLINTER, VIEWS, CRUMB, OFTEN, OVER, OVERLAP, OUTLIERS, COLORED, APART, PRESENT, TOLD, SLIM, STRAIGHT, ROUND, CROWN, LIGHT, PLACES, SHOWN } = language.things;
 const SIDE = 256; // pixels of a view's longer side
+const FIELDS = 10, MOST_KEPT = 5e5; // of an ellipse; ellipses of all views, 80 bytes each
 const HIDDEN = 1e-3; // of a pixel's light: what lies behind is not seen
 const HOT = 0.1; // share of a pixel that one hot Gaussian covers where the map may be hot
 const FINE = 512; // steps of the falloff's table for each squared standard deviation
 const FALLOFF = Float64Array.from({ length: 12 * FINE }, (_, k) => Math.exp(-k / FINE / 2)); // reaches beyond 2 log 255
 const RIDGE = 0.1, ROUNDS = 12; // strength of the colors' regularization, Newton steps
+const projections = new WeakMap(); // of views
+let kept = 0; // ellipses in them
 const DC = 0.28209479177387814; // of spherical harmonics: colors are compared as coefficients
 
 /** Find the things of a word: { things, candidates }, each largest first, and the word that all of them fit better, if there is
@@ -116,23 +119,21 @@ function neighborhood(centers, rows, distance) {
 
 /** Draw a view's heat, the mean depth of what is hot, and that of what is seen, at the pixels that something hot reaches. */
 export function drawn(view, scene, heat) {
-  const scale = Math.min(1, SIDE / Math.max(view.width, view.height)), { rows, codes, sizes } = view;
-  const [fx, fy, cx, cy] = [view.fx, view.fy, view.cx, view.cy].map((value) => value * scale);
-  const width = Math.round(view.width * scale), height = Math.round(view.height * scale), small = { ...view, fx, fy, cx, cy, width, height };
-  const [map, depth, surface, clear] = [0, 1, 2, 3].map(() => new Float32Array(width * height)), points = new Float32Array(3 * rows.length), ellipses = [];
-  for (let n = 0; n < rows.length; n++) {
-    const i = rows[n], place = seenAt(small, scene.centers.subarray(3 * i, 3 * i + 3)), [x, y, z] = place, one = z > 0 && ellipseOf(small, scene, i, place);
-    points.set([x, y, sizes[codes[n]] * view.width * view.height < FILLED ? NaN : z], 3 * n); // NaN belongs to no piece
-    if (one) ellipses.push(one);
-    if (one && heat[i] > LEVELS[0] && one.opacity > HOT) eachRow({ ...one, reach: 2 * Math.log(one.opacity / HOT) }, small, (first, last) => clear.fill(1, first, last));
-  }
-  const next = Int32Array.from({ length: clear.length + 1 }, (_, at) => at + (clear[at] === 0)); // leads to the next pixel that still matters
+  const { small, points, ellipses } = projected(view, scene), { width, height } = small;
+  const [map, depth, surface, clear] = [0, 1, 2, 3].map(() => new Float32Array(width * height));
+  let [top, end] = [Infinity, 0]; // of the pixels that something hot reaches
+  for (const one of listed(ellipses))
+    if (heat[one.i] > LEVELS[0] && one.opacity > HOT)
+      eachRow({ ...one, reach: 2 * Math.log(one.opacity / HOT) }, small, (first, last) => (clear.fill(1, first, last), (top = Math.min(top, first)), (end = Math.max(end, last))));
+  const next = new Int32Array(clear.length + 1).fill(clear.length); // leads to the next pixel that still matters
+  clear.forEach((light, at) => (next[at] = at + (light === 0)));
   const open = (at) => {
     while (next[at] !== at) at = next[at] = next[next[at]];
     return at;
   };
-  for (const one of ellipses.sort((a, b) => a.z - b.z)) {
-    const { i, z, opacity, narrow } = one;
+  for (const one of listed(ellipses)) {
+    const { i, y, z, opacity, narrow, high } = one;
+    if (y + high + 1 < top / width || y - high - 1 > end / width) continue;
     eachRow(one, small, (first, last, aside, far) => {
       for (let at = open(first); at < last; at = open(at + 1)) {
         const d = aside + at - first, share = clear[at] * Math.min(opacity * FALLOFF[((narrow * d * d + far) * FINE + 0.5) | 0], 0.999);
@@ -148,14 +149,40 @@ export function drawn(view, scene, heat) {
     if (map[at] > 0) depth[at] /= map[at];
     if (clear[at] < 1) surface[at] /= 1 - clear[at];
   }
-  return { map, depth, surface, width, height, rows, points, focal: fx };
+  return { map, depth, surface, width, height, rows: view.rows, points, focal: small.fx };
+}
+
+/** Project a view's Gaussians: their ellipses, nearest first, and their places. No word changes them, so they are
+ * kept, as far as memory allows. */
+function projected(view, scene) {
+  if (projections.has(view)) return projections.get(view);
+  const scale = Math.min(1, SIDE / Math.max(view.width, view.height)), { rows, codes, sizes } = view;
+  const [fx, fy, cx, cy] = [view.fx, view.fy, view.cx, view.cy].map((value) => value * scale);
+  const small = { ...view, fx, fy, cx, cy, width: Math.round(view.width * scale), height: Math.round(view.height * scale) };
+  const points = new Float32Array(3 * rows.length), ellipses = [];
+  for (let n = 0; n < rows.length; n++) {
+    const i = rows[n], place = seenAt(small, scene.centers.subarray(3 * i, 3 * i + 3)), [x, y, z] = place, one = z > 0 && ellipseOf(small, scene, i, place);
+    points.set([x, y, sizes[codes[n]] * view.width * view.height < FILLED ? NaN : z], 3 * n); // NaN belongs to no piece
+    if (one) ellipses.push(one);
+  }
+  const made = { small, points, ellipses: new Float64Array(FIELDS * ellipses.length) }; // a third of the memory of objects
+  ellipses.sort((a, b) => a.z - b.z).forEach((one, n) => made.ellipses.set(Object.values(one), FIELDS * n));
+  if ((kept += ellipses.length) < MOST_KEPT) projections.set(view, made);
+  return made;
+}
+
+/** List the ellipses of `projected`, one by one, as `ellipseOf` has them. */
+function* listed(flat) {
+  for (let k = 0; k < flat.length; k += FIELDS)
+    yield { i: flat[k], x: flat[k + 1], y: flat[k + 2], z: flat[k + 3], opacity: flat[k + 4], reach: flat[k + 5],
+      tall: flat[k + 6], high: flat[k + 7], slope: flat[k + 8], narrow: flat[k + 9] }; // prettier-ignore
 }
 
 /** Find the ellipse that a Gaussian fills in a view; null if it fills none. */
 function ellipseOf(view, { axes, opacities, antialiased }, i, [x, y, z]) {
   const [a, uv, b] = spreadAt(view, axes, i, [x, y, z]), uu = a + BLUR, vv = b + BLUR, area = uu * vv - uv * uv;
   const opacity = opacities[i] * (antialiased ? Math.sqrt(Math.max((a * b - uv * uv) / area, 0)) : 1), reach = 2 * Math.log(255 * opacity);
-  return reach > 0 ? { i, x, y, z, opacity, reach, tall: vv, slope: uv / vv, narrow: vv / area } : null;
+  return reach > 0 ? { i, x, y, z, opacity, reach, tall: vv, high: Math.sqrt(reach * vv), slope: uv / vv, narrow: vv / area } : null;
 }
 
 /** Go through the rows of pixels that an ellipse fills: the first pixel, the one after the last, how far the first lies
