@@ -1,7 +1,6 @@
 """Splat files, our own and of other programs: one scene, however it is written; and files that are none."""
 
 import gzip
-import pickle
 import struct
 from dataclasses import replace
 
@@ -9,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
+from made_splats import assert_alike, gsplat_state, some_splats
 from moved_splats import with_colors
 from numpy.lib import recfunctions
 
@@ -17,29 +17,6 @@ from lang3dxl_ns.files.activations import log_scales, logits
 from lang3dxl_ns.files.read_splats import find_splats, read_splats
 from lang3dxl_ns.files.splat_file import write_splats
 from lang3dxl_ns.rendering import Splats
-
-
-def some_splats(count: int = 300, bands: int = 4) -> Splats:
-    g = torch.Generator().manual_seed(0)
-
-    def rand(*shape):
-        return torch.rand(count, *shape, generator=g)
-
-    quats = F.normalize(rand(4) - 0.5, dim=1)
-    return Splats(rand(3) * 4 - 2, quats, 0.02 + rand(3), 0.05 + 0.9 * rand(), rand(bands, 3) - 0.5)
-
-
-def assert_alike(
-    found: Splats, wanted: Splats, means=1e-6, scales=1e-5, opacities=1e-5, colors=1e-6, turn=1e-6
-):
-    assert len(found) == len(wanted)
-    torch.testing.assert_close(found.means, wanted.means, atol=means, rtol=0)
-    torch.testing.assert_close(found.scales.log(), wanted.scales.log(), atol=scales, rtol=0)
-    torch.testing.assert_close(found.opacities, wanted.opacities, atol=opacities, rtol=0)
-    torch.testing.assert_close(found.harmonics, wanted.harmonics, atol=colors, rtol=0)
-    # q and −q are the same rotation.
-    cosine = (F.normalize(found.quats, dim=1) * F.normalize(wanted.quats, dim=1)).sum(1).abs()
-    assert float(cosine.min()) > 1 - turn
 
 
 def table(path) -> tuple[list[str], np.ndarray]:
@@ -224,52 +201,6 @@ def test_a_splat_of_the_web_is_read(tmp_path):
     assert_alike(read_splats(tmp_path / "a.splat"), splats, opacities=3e-3, colors=0.01, turn=1e-4)
 
 
-def gsplat_state(splats: Splats) -> dict:
-    parts = {"means": splats.means, "scales": log_scales(splats), "quats": splats.quats}
-    parts |= {"opacities": logits(splats), "sh0": splats.harmonics[:, :1], "shN": splats.harmonics[:, 1:]}
-    return {"step": 29_999, "splats": parts}
-
-
-def splatfacto_state(splats: Splats) -> dict:
-    parts = {"means": splats.means, "scales": log_scales(splats), "quats": splats.quats}
-    parts |= {"opacities": logits(splats)[:, None], "features_dc": splats.harmonics[:, 0]}
-    parts |= {"features_rest": splats.harmonics[:, 1:]}
-    return {"step": 9, "pipeline": {f"_model.gauss_params.{name}": value for name, value in parts.items()}}
-
-
-def test_checkpoints_of_gsplat_and_splatfacto_are_read(tmp_path):
-    splats = some_splats(bands=16)
-    torch.save(gsplat_state(splats), tmp_path / "ckpt_29999_rank0.pt")
-    assert_alike(read_splats(tmp_path / "ckpt_29999_rank0.pt"), splats)
-    (tmp_path / "nerfstudio_models").mkdir()
-    torch.save(splatfacto_state(splats), tmp_path / "nerfstudio_models" / "step-000000009.ckpt")
-    (tmp_path / "config.yml").write_text("!!python/object:any.Thing\nrasterize_mode: antialiased\n")
-    found = read_splats(tmp_path)
-    assert_alike(found, splats)
-    assert found.antialiased
-
-
-def test_a_checkpoint_that_holds_numpy_scalars_is_read(tmp_path):
-    """As learning rates of schedulers are."""
-    splats = some_splats()
-    rates = {"lr": np.float64(0.1), "steps": [np.int32(3), np.float32(2)], "big": np.dtype(">f8").type(1)}
-    torch.save(splatfacto_state(splats) | {"optimizers": rates}, tmp_path / "step-1.ckpt")
-    assert_alike(read_splats(tmp_path / "step-1.ckpt"), splats)
-    torch.save(gsplat_state(splats) | {"rate": rates["lr"]}, tmp_path / "a.pt")
-    assert_alike(read_splats(tmp_path / "a.pt"), splats)
-    with pytest.raises(pickle.UnpicklingError):  # elsewhere they stay refused
-        torch.load(tmp_path / "a.pt", weights_only=True)
-
-
-def test_a_splatfacto_of_one_color_per_gaussian_stores_logits_of_it(tmp_path):
-    splats = some_splats(bands=1)
-    colors = (splats.harmonics[:, 0] * 0.28209479 + 0.5).clamp(0.01, 0.99)
-    state = splatfacto_state(with_colors(splats, colors))
-    state["pipeline"]["_model.gauss_params.features_dc"] = colors.logit()
-    torch.save(state, tmp_path / "step-1.ckpt")
-    torch.testing.assert_close(read_splats(tmp_path / "step-1.ckpt").colors(torch.zeros(3)), colors)
-
-
 def test_a_run_folder_means_its_latest_splat(tmp_path):
     for step in (7_000, 30_000, 9_000):
         place = tmp_path / "point_cloud" / f"iteration_{step}"
@@ -356,17 +287,6 @@ def test_an_spz_is_measured_before_it_is_unpacked(tmp_path):
             read_splats(tmp_path / name)
 
 
-def test_checkpoints_in_the_old_format_and_of_other_shapes_are_told(tmp_path):
-    state = gsplat_state(some_splats(20))
-    torch.save(state, tmp_path / "old.pt", _use_new_zipfile_serialization=False)
-    with pytest.raises(UserError, match=r"old\.pt: it is not a checkpoint of torch 1\.6 or later: save it"):
-        read_splats(tmp_path / "old.pt")
-    state["splats"]["quats"] = state["splats"]["quats"][:, :3]
-    torch.save(state, tmp_path / "flat.pt")
-    with pytest.raises(UserError, match=r"flat\.pt.*\[3, 3, 3, 3\] numbers a Gaussian"):
-        read_splats(tmp_path / "flat.pt")
-
-
 def test_a_ply_cut_anywhere_is_refused(tmp_path):
     write_splats(tmp_path / "a.ply", some_splats(20))
     content = (tmp_path / "a.ply").read_bytes()
@@ -443,14 +363,6 @@ def test_what_a_ply_lists_twice_is_refused(line, tmp_path):
     (tmp_path / "a.ply").write_bytes(header + line + b"end_header\n" + body)
     with pytest.raises(UserError, match=r"twice|more than once"):
         read_splats(tmp_path / "a.ply")
-
-
-def test_a_checkpoint_of_several_gpus_is_read_whole(tmp_path):
-    splats = some_splats()
-    for rank, part in enumerate((splats.select(torch.arange(100)), splats.select(torch.arange(100, 300)))):
-        torch.save(gsplat_state(part), tmp_path / f"ckpt_6999_rank{rank}.pt")
-    for file in ("ckpt_6999_rank0.pt", "ckpt_6999_rank1.pt"):
-        assert_alike(read_splats(tmp_path / file), splats)
 
 
 def test_an_spz_of_map_coordinates_is_refused_rather_than_cut(tmp_path):
@@ -541,23 +453,6 @@ def test_cloudcompares_names_half_floats_and_lists_of_one_length_are_read(tmp_pa
     (tmp_path / "b.ply").write_bytes("\n".join(head).encode() + bytes(3) + wide.tobytes())
     with pytest.raises(UserError, match="hold lists ids of different lengths"):
         read_splats(tmp_path / "b.ply")
-
-
-def test_older_names_in_checkpoints_are_read(tmp_path):
-    splats, config = some_splats(), tmp_path / "cfg.yml"
-    state = gsplat_state(splats)
-    state["splats"]["means3d"] = state["splats"].pop("means")
-    (tmp_path / "ckpts").mkdir()
-    torch.save(state, tmp_path / "ckpts" / "a.pt")
-    assert_alike(read_splats(tmp_path / "ckpts" / "a.pt"), splats)
-    config.write_text("antialiased: true\n")
-    assert read_splats(tmp_path / "ckpts" / "a.pt").antialiased
-    state = splatfacto_state(splats)
-    parts = {name.replace("gauss_params.", ""): value for name, value in state["pipeline"].items()}
-    first, rest = parts.pop("_model.features_dc"), parts.pop("_model.features_rest")
-    parts["_model.colors_all"] = torch.cat([first[:, None], rest], dim=1)
-    torch.save({"pipeline": parts}, tmp_path / "b.ckpt")
-    assert_alike(read_splats(tmp_path / "b.ckpt"), splats)
 
 
 @pytest.mark.parametrize("share", [0.01, 0.8])
