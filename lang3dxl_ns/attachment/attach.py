@@ -142,8 +142,9 @@ def _read(path: Path) -> Splats:
 
 def _frame(splats: Splats, collection: Capture, path: Path, place: Path | None) -> Similarity:
     """Find and report the similarity from the photos' frame to the splat's, or raise UserError."""
-    if collection.left_out:
-        say(f"{len(collection.left_out)} photos are left out: {some(list(collection.left_out.values()), 3)}")
+    reasons = [*collection.left_out.values(), *collection.contradicted.values()]
+    if reasons:
+        say(f"{len(reasons)} photos are left out: {some(reasons, 3)}")
     fit, shown = find_frame(splats, collection, path), ""
     if not fit.fits:
         if place is not None:

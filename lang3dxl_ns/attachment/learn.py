@@ -34,11 +34,11 @@ def photos_of(
     cache: Path,
     device: torch.device | str,
 ) -> TrainingData:
-    """Return all photos of a capture, to learn from by `settled` settings, with their cameras in the
-    splat's frame, where splat's = similarity · photos'. The folder `cache` keeps foreground and targets,
-    where training also finds them."""
+    """Return all photos of a capture whose poses are not contradicted, to learn from by `settled` settings,
+    with their cameras in the splat's frame, where splat's = similarity · photos'. The folder `cache` keeps
+    foreground and targets, where training also finds them."""
     scale = float(np.cbrt(np.linalg.det(similarity[:3, :3])))
-    everything, frame = Split(tuple(capture.names), ()), Frame(similarity[:3] / scale, scale)
+    everything, frame = Split(tuple(capture.sure), ()), Frame(similarity[:3] / scale, scale)
     capture = replace(capture, known_split=everything, known_frame=frame)
     return TrainingData(capture, config, cache, device, targets_in_steps=False)
 

@@ -59,14 +59,11 @@ def read_splats(path: str | Path) -> Splats:
     large for this machine or of another kind, or most of its values are not finite."""
     path = find_splats(path)
     reader = _READERS.get(path.suffix.lower())
-    if path.suffix == SUFFIX:
-        raise UserError(
-            f"{path.name} is a scene already: ask it, or give a splat that `lang3dxl export` wrote"
-        )
     if reader is None:
-        raise UserError(
-            f"{path.name} has an unsupported format: give {KINDS}; SuperSplat makes a .ply of others"
-        )
+        told = f"has an unsupported format: give {KINDS}; SuperSplat makes a .ply of others"
+        if path.suffix == SUFFIX:
+            told = "is a scene already: ask it, or give a splat that `lang3dxl export` wrote"
+        raise UserError(f"{path.name} {told}")
     try:
         # gsplat on several GPUs leaves a file of each (ckpt_6999_rank1.pt).
         ranks = re.fullmatch(r"(ckpt_\d+_rank)\d+\.pt", path.name)

@@ -120,7 +120,7 @@ class Capture:
 
     def _of_lists(self, train: frozenset[str] | None, held_out: frozenset[str] | None) -> Split:
         """Split by two lists. One that is missing holds all other photos whose poses are not contradicted."""
-        sure = frozenset(self._sure)
+        sure = frozenset(self.sure)
         chosen = train or sure.difference(held_out or ())
         others = held_out or sure.difference(chosen)
         return Split(*(tuple(n for n in self.names if n in part) for part in (chosen, others)))
@@ -131,15 +131,20 @@ class Capture:
             return listed(read_names(path), {*self.names, *self.left_out}, "it")
 
     def _split_by_rule(self) -> Split:
-        sure, every = self._sure, self.settings.eval_interval
+        sure, every = self.sure, self.settings.eval_interval
         if self.settings.eval_mode == "all":
             return Split(tuple(sure), tuple(sure))
         return Split(tuple(n for i, n in enumerate(sure) if i % every), tuple(sure[::every]))
 
     @property
-    def _sure(self) -> list[str]:
-        """Photos whose poses are not contradicted."""
-        return [name for name in self.names if self.doubtful.get(name) != CONTRADICTED]
+    def sure(self) -> list[str]:
+        """Names of the usable photos whose poses are not contradicted."""
+        return [name for name in self.names if name not in self.contradicted]
+
+    @property
+    def contradicted(self) -> dict[str, str]:
+        """Photos that most of their matches contradict, with that reason."""
+        return {name: why for name, why in self.doubtful.items() if why == CONTRADICTED}
 
     @cached_property
     def frame(self) -> Frame:
@@ -245,7 +250,8 @@ def find_source(
     if may_reconstruct and find_photos(folder).names:
         mention_other_cameras(folder)
         return reconstruct_scene(folder, cache_dir)
-    if may_reconstruct and not any(map(any, map(folder.rglob, ("images.[bt]*", "cameras.[bt]*")))):
+    of_models = (path for part in ("images", "cameras") for path in folder.rglob(f"{part}.[bt]*"))
+    if may_reconstruct and not any(of_models):
         lacks = "holds no photos and no COLMAP model" if any(folder.iterdir()) else "is empty"
         raise UserError(f"{folder} {lacks}: give the folder with your photos (then lang3dxl reconstruct)")
     return folder, folder / MODEL_FOLDERS[0]  # reading it tells what is missing
@@ -403,6 +409,7 @@ def say_left_out(capture: Capture) -> None:
     if capture.left_out:
         say(f"{len(capture.left_out)} photos of {capture.source} are left out:")
         say(*(f"  {printable(name)}: {why}" for name, why in capture.left_out.items()))
-    used = frozenset().union(*(capture.split if capture.doubtful else ()))  # an empty part is an error
-    unused = {name: why for name, why in capture.doubtful.items() if name not in used}
-    say(*reasons_in_words({"doubtfully placed, and not used": unused}))
+    if capture.contradicted:
+        used = frozenset().union(*capture.split)
+        unused = {name: why for name, why in capture.contradicted.items() if name not in used}
+        say(*reasons_in_words({"doubtfully placed, and not used": unused}))

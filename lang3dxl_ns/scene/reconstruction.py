@@ -21,7 +21,7 @@ CONTRADICTED, LONELY = (
     "most of its matches are with photos placed elsewhere",
     "only one other photo supports it",
 )
-"""Reasons to doubt a photo's place. Of the first kind half stand wrong, of the second hardly any."""
+"""Reasons to doubt a photo's place. docs/lab/reconstruction.md tells how many of either kind stand wrong."""
 
 
 @dataclass

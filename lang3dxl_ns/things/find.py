@@ -97,7 +97,8 @@ def things_of(scene: Answering, question: Question) -> list[Things]:
     question = _in_singular(scene, question)
     mass = scene.mass.double().cpu().numpy()
     means, axes = scene.splats.means.double().cpu().numpy(), axes_of(scene)
-    colors = harmonics_of(scene.baked().colors(scene.overview.camera.position).clamp(0, 1))[:, 0].nan_to_num()
+    colors = harmonics_of(scene.baked().colors(scene.overview.camera.position).clamp(0, 1))[:, 0]
+    colors = colors.nan_to_num()  # of Gaussians that lie nowhere
     sharp = [_sharpened(scene, relevancy, colors.cpu().numpy()) for relevancy in question.relevancy]
     peak = peaks(question.relevancy).tolist()  # a word below the lowest level names nothing here
     pieces: list[list[Piece]] = [[] for _ in sharp]
@@ -129,7 +130,9 @@ def things_of(scene: Answering, question: Question) -> list[Things]:
         if better and not things:
             caution = f"what was found fits {next(iter(better.values()))!r} better"
         if shown_in < VIEWS:
-            caution = f"{shown_in} training photos show the scene, and things are what two or more show"
+            caution = (
+                f"{'one' if shown_in else 'no'} training photo shows the scene, and a thing is what two show"
+            )
         answers.append(Things(prompt.text, things, candidates, caution))
     return answers
 

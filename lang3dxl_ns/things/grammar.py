@@ -114,7 +114,9 @@ def parse(text: str, names: Iterable[str] = ()) -> Request:
     rest, restored = held(text, names)
     rest = " ".join(rest.lower().strip(" ?!.").split())
     if len(rest) > words["longest"]:
-        raise UserError(f"a question has at most {words['longest']} letters, this {len(rest):,}: ask less")
+        raise UserError(
+            f"this question has {len(rest):,} letters: ask for one thing, in {words['longest']} at most"
+        )
     count, rest = _taken(rest, TABLE["count"])
     _, rest = _taken(rest, TABLE["lead"])
     relation, tail = _any(words["relations"]), _any(words["tail"])

@@ -115,7 +115,8 @@ class TrainingData:
 
     @cached_property
     def as_read(self) -> list[Photo]:
-        """Photos of both splits, training photos first, and doubtful ones, without foreground masks."""
+        """Photos of both splits, training photos first, then those that neither uses since their poses are
+        contradicted, without foreground masks."""
         side = self.config.longer_side
         known = {photo.name: photo.at_most(side) for photo in self.capture.photos}
         large = sum(max(photo.width, photo.height) > side for photo in self.capture.photos)
@@ -125,7 +126,7 @@ class TrainingData:
                 f"({data_option('longer-side')})"
             )
         train, held_out = self.capture.split
-        return [known[name] for name in dict.fromkeys((*train, *held_out, *self.capture.doubtful))]
+        return [known[name] for name in dict.fromkeys((*train, *held_out, *self.capture.contradicted))]
 
     @cached_property
     def photos(self) -> dict[str, Photo]:
@@ -173,10 +174,12 @@ class TrainingData:
         """Targets of all photos, which are made on first use; None if only colors are trained."""
         if self.config.clip == "none":
             return None
-        fine = list(self.capture.split.train) if self.config.crops == "fine" else []
+        train, held_out = self.capture.split
+        used = [self.photos[name] for name in dict.fromkeys((*train, *held_out))]
+        fine = list(train) if self.config.crops == "fine" else []
         say(*self.crops.reasons)
         return prepare(
-            list(self.photos.values()), self.crops.pixel_sizes, self.config, self.crops.scales,
+            used, self.crops.pixel_sizes, self.config, self.crops.scales,
             FeatureStore(self.cache_dir), self.device, self._regions, fine,
         )  # fmt: skip
 

@@ -12,7 +12,7 @@ const plain = (text) => text.trim().replace(new RegExp(`^(?:(?:${any(language.ar
  * a phrase, and so do names, which were taught. Throws an error, which names the part, for what the grammar doesn't know. */
 export function parse(text, names = []) {
   const { rest, count, restored } = opened(text, names);
-  if (rest.length > grammar.longest) throw new Error(`a question has at most ${grammar.longest} letters, this ${rest.length.toLocaleString("en")}: ask less`);
+  if (rest.length > grammar.longest) throw new Error(`this question has ${rest.length.toLocaleString("en")} letters: ask for one thing, in ${grammar.longest} at most`);
   try {
     return { ...request(rest, restored), count };
   } catch (error) {

@@ -14,8 +14,6 @@ const HOT = 0.1; // share of a pixel that one hot Gaussian covers where the map 
 const FINE = 512; // steps of the falloff's table for each squared standard deviation
 const FALLOFF = Float64Array.from({ length: 12 * FINE }, (_, k) => Math.exp(-k / FINE / 2)); // reaches beyond 2 log 255
 const RIDGE = 0.1, ROUNDS = 12; // strength of the colors' regularization, Newton steps
-const projections = new WeakMap(); // of views
-let kept = 0; // ellipses in them
 const DC = 0.28209479177387814; // of spherical harmonics: colors are compared as coefficients
 
 /** Find the things of a word: { things, candidates }, each largest first, and the word that all of them fit better, if there is
@@ -122,7 +120,7 @@ export function drawn(view, scene, heat) {
   const { small, points, ellipses } = projected(view, scene), { width, height } = small;
   const [map, depth, surface, clear] = [0, 1, 2, 3].map(() => new Float32Array(width * height));
   let [top, end] = [Infinity, 0]; // of the pixels that something hot reaches
-  for (const one of listed(ellipses))
+  for (const one of each(ellipses))
     if (heat[one.i] > LEVELS[0] && one.opacity > HOT)
       eachRow({ ...one, reach: 2 * Math.log(one.opacity / HOT) }, small, (first, last) => (clear.fill(1, first, last), (top = Math.min(top, first)), (end = Math.max(end, last))));
   const next = new Int32Array(clear.length + 1).fill(clear.length); // leads to the next pixel that still matters
@@ -131,7 +129,7 @@ export function drawn(view, scene, heat) {
     while (next[at] !== at) at = next[at] = next[next[at]];
     return at;
   };
-  for (const one of listed(ellipses)) {
+  for (const one of each(ellipses)) {
     const { i, y, z, opacity, narrow, high } = one;
     if (y + high + 1 < top / width || y - high - 1 > end / width) continue;
     eachRow(one, small, (first, last, aside, far) => {
@@ -152,6 +150,9 @@ export function drawn(view, scene, heat) {
   return { map, depth, surface, width, height, rows: view.rows, points, focal: small.fx };
 }
 
+const projections = new WeakMap(); // of views
+let kept = 0; // ellipses in them
+
 /** Project a view's Gaussians: their ellipses, nearest first, and their places. No word changes them, so they are
  * kept, as far as memory allows. */
 function projected(view, scene) {
@@ -167,12 +168,15 @@ function projected(view, scene) {
   }
   const made = { small, points, ellipses: new Float64Array(FIELDS * ellipses.length) }; // a third of the memory of objects
   ellipses.sort((a, b) => a.z - b.z).forEach((one, n) => made.ellipses.set(Object.values(one), FIELDS * n));
-  if ((kept += ellipses.length) < MOST_KEPT) projections.set(view, made);
+  if (kept + ellipses.length <= MOST_KEPT) {
+    kept += ellipses.length;
+    projections.set(view, made);
+  }
   return made;
 }
 
-/** List the ellipses of `projected`, one by one, as `ellipseOf` has them. */
-function* listed(flat) {
+/** List the ellipses of `projected`, one by one, in the order of `ellipseOf`'s fields. */
+function* each(flat) {
   for (let k = 0; k < flat.length; k += FIELDS)
     yield { i: flat[k], x: flat[k + 1], y: flat[k + 2], z: flat[k + 3], opacity: flat[k + 4], reach: flat[k + 5],
       tall: flat[k + 6], high: flat[k + 7], slope: flat[k + 8], narrow: flat[k + 9] }; // prettier-ignore

@@ -11,6 +11,7 @@ from PIL import Image, PngImagePlugin
 from scenes import write_ply, write_scene, write_transforms
 from scipy.spatial.transform import Rotation
 
+from lang3dxl_ns.attachment.learn import photos_of
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.pictures import mask_values, open_picture
 from lang3dxl_ns.preparation.settings import PreparationConfig
@@ -573,6 +574,8 @@ def test_contradicted_photos_are_recorded_and_used_only_if_a_list_trains_on_them
     assert {photo.name: photo.doubtful for photo in record.photos if photo.doubtful} == capture.doubtful
     assert sorted(photo.name for photo in record.photos) == capture.names
     assert recorded_capture(record).split == capture.split
+    attached = photos_of(capture, np.eye(4), PreparationConfig(clip="none"), tmp_path, "cpu")
+    assert sorted(attached.capture.split.train) == sorted((*train, *held_out))
     (folder / "train_list.txt").write_text("photo_002.png\nphoto_003.png\n")
     listed = open_capture(folder).split
     assert listed == (("photo_002.png", "photo_003.png"), ("photo_001.png", "photo_004.png", "photo_005.png"))

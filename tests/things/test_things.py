@@ -222,7 +222,7 @@ def test_what_fewer_than_two_photos_show_counts_nothing_and_says_so():
     (answer,) = painted_scene(file=replace(painted_file(), photos=painted_file().photos[:1])).things(
         "windows"
     )
-    assert not answer.things and "1 training photos show the scene" in answer.caution
+    assert not answer.things and "one training photo shows the scene" in answer.caution
 
 
 def test_a_place_that_fits_less_than_things_do_is_a_candidate_beside_one_that_fits():

@@ -225,6 +225,7 @@ def test_a_view_is_drawn_as_python_renders_it(page, antialiased):
     given = {"packed": packed, "heat": heat.tolist(), "view": view, "antialiased": antialiased}
     body = """const { unpackSplats } = await import("./pick.js"), { packed, view, antialiased, heat } = given;
       const scene = { ...unpackSplats(Uint8Array.from(packed).buffer), antialiased };
+      m.drawn(view, scene, heat.map((value) => 1 - value)); // of another word: its projection is kept
       const { map, depth, surface } = m.drawn(view, scene, heat);
       return [map, depth, surface].map((one) => [...one]);"""
     drawn = np.array(module(page, "things", body, given)).reshape(3, 60, 80)
@@ -353,7 +354,7 @@ def test_a_plural_is_one_thing_of_pythons(page):
         "gargoyls",
         "windows on the left",
     ]
-    texts += [f"{word}s" for word in shipped_vocabulary()]
+    texts += [*common_words(), *(f"{word}s" for word in shipped_vocabulary())]
     body = """const { Vocabulary } = await import("./vocabulary.js"), { words, texts } = given;
       const vocabulary = Object.create(Vocabulary.prototype);
       Object.assign(vocabulary, { words: [...words, "gargoyl"], common: words.length });
