@@ -28,6 +28,7 @@ from lang3dxl_ns.web.write_page import Page, write_page
 _READ_BY: dict[str, tuple[str, ...]] = dict.fromkeys(("title", "credit", "license"), ("web", "scene_file"))
 _READ_BY |= dict.fromkeys(("text", "not_", "look"), ("out", "web"))
 _READ_BY |= {"vocabulary": ("web",), "photos": ("web",), "all": ("out",), "hide_floaters": ("out",)}
+_READ_BY |= {"things": ("video",)}
 """Targets of `export` that read an option. Options that are not listed are read by every target."""
 
 
@@ -48,6 +49,8 @@ class Export(OfScene):
     """Folder for a web page that any static server can serve."""
     video: Path | None = None
     """Video to write, such as out.mp4, of the tour that the page kept in the scene's file (needs ffmpeg)."""
+    things: bool = False
+    """Draw numbered boxes of the things that the tour's words name, in place of heat."""
     vocabulary: Path | None = None
     """File of more words that may name a place on the page, one per line."""
     photos: Path | None = None
@@ -123,7 +126,7 @@ class Export(OfScene):
         say(f"Wrote {size / 1e6:.1f} MB to {path}; ask it: {ask}")
 
     def _video(self, path: Path, scene: Scene, _: list[Prompt]) -> None:
-        count = write_video(path, scene, tour_shots(scene, self._told().tour))
+        count = write_video(path, scene, tour_shots(scene, self._told().tour), self.things)
         say(f"Wrote {count} pictures, {count / RATE:.0f} seconds, to {path}")
 
     def _clip_words(self, clip: str | None) -> tuple[str, ...]:

@@ -33,6 +33,10 @@ _LARGE = 1_500_000
 """Pixels of a file above which the JPEG decoder shrinks it: in half of the time, 50 dB from exact."""
 
 
+_LEAST_SEEN = 0.1
+"""Share of a pinhole's view that a photo must have. Wide lenses leave about half."""
+
+
 @dataclass(frozen=True)
 class Photo(HasLens):
     """Photo on disk with its lens, read upright and at the lens's size, whose aspect ratio the file has. No
@@ -52,11 +56,16 @@ class Photo(HasLens):
     def from_model(cls, tracked: TrackedPhoto, path: Path, mask_path: Path | None = None) -> Photo:
         """Create a photo from the model (after `upright_in_model`), with its lens at the size of the file on
         disk, so that resized photos work. Without a mask, a photo with transparent parts is its own. Raises
-        UserError for an unreadable file and for another aspect ratio."""
+        UserError for an unreadable file, another aspect ratio, and a lens that no photo can have."""
         with _readable(path, tracked.name), open_picture(path) as image:
             size = _turned_size(image.size, tracked.quarter_turns)
             mask_path = mask_path or (path if see_through(image) else None)
         _check_shape(tracked.name, path, size, (tracked.width, tracked.height))
+        if tracked.lens.distorts and (share := _share_seen(tracked.lens)) < _LEAST_SEEN:
+            raise UserError(
+                f"photo {tracked.name}: its lens bends so much that {share:.0%} of an undistorted view shows "
+                "the photo: its distortion is wrong. Undistort the photos with the program that made the model"
+            )
         return cls(tracked.name, path, mask_path, tracked.lens.resized(*size), tracked.quarter_turns)
 
     def file_size(self) -> tuple[int, int]:
@@ -175,6 +184,13 @@ def _undistortion(lens: Lens) -> tuple[Float32[Array, "h w"], Float32[Array, "h 
     undistort = (cv2.fisheye if lens.fisheye else cv2).initUndistortRectifyMap
     columns, rows = undistort(pinhole, coefficients, np.eye(3), pinhole, size, cv2.CV_32FC1)
     return columns, rows, _seen(columns, rows)
+
+
+@lru_cache(maxsize=256)
+def _share_seen(lens: Lens) -> float:
+    """Return the share of a pinhole's view that a photo through the lens has."""
+    small = lens.scaled(min(1.0, 64 / max(lens.width, lens.height)))
+    return float(_undistortion(small)[2].mean())
 
 
 def _seen(columns: Float32[Array, "h w"], rows: Float32[Array, "h w"]) -> Bool[Array, "h w"]:

@@ -1,4 +1,4 @@
-"""Videos of a flight along a tour, with the heat of words and captions (ffmpeg)."""
+"""Videos of a flight along a tour, with the heat or the things of words and captions (ffmpeg)."""
 
 from __future__ import annotations
 
@@ -25,7 +25,8 @@ from lang3dxl_ns.query.match import together
 from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.query.text import Prompt, parse_prompts
 from lang3dxl_ns.scene.camera import Camera, Lens, check_pose, view_matrix
-from lang3dxl_ns.things.find import up_of
+from lang3dxl_ns.things.find import Things, things_of, up_of
+from lang3dxl_ns.things.outlines import outlined
 
 RATE, SIZE = 25, (1280, 720)
 """Pictures per second, and their width and height in pixels."""
@@ -74,9 +75,10 @@ def _camera(stand: Float64[Array, "7"], up: Float64[Array, "3"], size: tuple[int
     return lens.camera(view_matrix(torch.from_numpy(pose[:3]).float()))
 
 
-def write_video(path: Path, scene: Scene, shots: Sequence[Shot]) -> int:
-    """Write a video in the format that the name's ending tells, and return the number of pictures. Raises
-    UserError without ffmpeg, or if it can't write the file."""
+def write_video(path: Path, scene: Scene, shots: Sequence[Shot], things: bool = False) -> int:
+    """Write a video in the format that the name's ending tells, and return the number of pictures. things:
+    draw numbered boxes of what prompts name in place of heat. Raises UserError without ffmpeg, or if it can't
+    write the file."""
     if shutil.which("ffmpeg") is None:
         raise UserError("a video needs ffmpeg: apt install ffmpeg, or conda install ffmpeg")
     first, path = shots[0][0], expanded(path).absolute()
@@ -87,7 +89,7 @@ def write_video(path: Path, scene: Scene, shots: Sequence[Shot]) -> int:
     try:
         with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as process:
             with suppress(BrokenPipeError):  # ffmpeg says why
-                for picture in _pictures(scene, tracked(shots, "rendering")):
+                for picture in _pictures(scene, tracked(shots, "rendering"), things):
                     process.stdin.write(picture)  # type: ignore[union-attr]
             said = " ".join(process.communicate()[1].decode(errors="replace").split())
         if process.returncode:
@@ -98,14 +100,17 @@ def write_video(path: Path, scene: Scene, shots: Sequence[Shot]) -> int:
     return sum(count for *_, count in shots)
 
 
-def _pictures(scene: Scene, shots: Iterable[Shot]) -> Iterator[bytes]:
+def _pictures(scene: Scene, shots: Iterable[Shot], things: bool) -> Iterator[bytes]:
     """Render the shots, and yield the pixels of each picture."""
-    asked, question = None, None
+    asked, question, found = None, None, list[Things]()
     for camera, prompts, caption, count in shots:
         if prompts != asked:
             asked, question = prompts, scene.ask(list(prompts)) if prompts else None
-        heat = None if question is None else together(scene.matches(question, camera))
-        pixels = scene.render(camera).pixels if heat is None else heat[: camera.height]  # without the legend
+            found = things_of(scene, question) if question is not None and things else []
+        if question is None or things:
+            pixels = outlined(scene.splats, found, scene.render(camera).rendering)
+        else:
+            pixels = together(scene.matches(question, camera))[: camera.height]  # without the legend
         picture = Image.fromarray(np.ascontiguousarray(pixels))
         if caption:
             place, font = (camera.width / 2, 0.93 * camera.height), ImageFont.load_default(camera.height / 24)

@@ -281,6 +281,16 @@ def test_a_polynomial_that_turns_back_shows_nothing_twice(tmp_path):
     assert not seen[radius > turn + 0.05].any()
 
 
+@pytest.mark.parametrize("fisheye", [False, True])
+@pytest.mark.parametrize("bend", [1e9, -1e9, 1e30, -400.0, 400.0])
+def test_a_lens_that_no_photo_can_have_is_refused(tmp_path, bend, fisheye):
+    scene = write_scene(tmp_path / "s", 3, (160, 120), points=50, image_ext="png")
+    (tracked, *_) = read_reconstruction(scene / "sparse" / "0").photos.values()
+    absurd = with_lens(tracked, distortion=(bend, 0.0, 0.0, 0.0), fisheye=fisheye)
+    with pytest.raises(UserError, match="distortion is wrong"):
+        Photo.from_model(absurd, scene / "images" / tracked.name)
+
+
 def test_the_mask_is_undistorted_with_the_photo(tmp_path):
     picture = np.zeros((120, 160), np.uint8)
     picture[:, 120:] = 255

@@ -17,6 +17,8 @@ from lang3dxl_ns.files.scene_file import (
     read_scene,
     replace_scene,
 )
+from lang3dxl_ns.query.text import Prompt
+from lang3dxl_ns.things.outlines import outlined
 from lang3dxl_ns.web.teach import PageWords
 from lang3dxl_ns.web.video import tour_shots, write_video
 from lang3dxl_ns.web.write_page import Page, write_page
@@ -126,6 +128,13 @@ def test_a_page_that_is_served_opens_with_the_tour_kept_last():
     assert json.loads(page.files()["scene.json"])["tour"] == TOUR
 
 
+def frames(path, camera):
+    """Read the pictures of a video."""
+    read = ["ffmpeg", "-loglevel", "error", "-i", str(path), "-pix_fmt", "rgb24", "-f", "rawvideo", "-"]
+    done = subprocess.run(read, capture_output=True, check=True)
+    return np.frombuffer(done.stdout, np.uint8).reshape(-1, camera.height, camera.width, 3).astype(float)
+
+
 def test_a_video_may_have_sides_of_any_length(tmp_path):
     scene = painted_scene()
     assert write_video(tmp_path / "odd.mp4", scene, [(*tour_shots(scene, TOUR, (97, 63))[0][:3], 1)]) == 1
@@ -143,13 +152,24 @@ def test_a_video_flies_through_the_tour(tmp_path):
     turned = last.view_matrix.double().numpy() @ [0, 0, 0, 1]
     assert turned[2] > 0 and np.abs(turned[:2]).max() < 1e-5  # it looks at what the stop turns around
     count = write_video(tmp_path / "a.mkv", scene, [(*shot[:3], 1) for shot in shots[-3:]])
-    raw = ["-pix_fmt", "rgb24", "-f", "rawvideo", "-"]
-    read = ["ffmpeg", "-loglevel", "error", "-i", str(tmp_path / "a.mkv"), *raw]
-    done = subprocess.run(read, capture_output=True, check=True)
-    pictures = np.frombuffer(done.stdout, np.uint8).reshape(-1, 64, 96, 3)
+    pictures = frames(tmp_path / "a.mkv", last)
     assert count == len(pictures) == 3
-    assert np.abs(pictures[-1].astype(float) - scene.render(last).pixels).mean() < 8
+    assert np.abs(pictures[-1] - scene.render(last).pixels).mean() < 8
     assert [path.name for path in tmp_path.iterdir()] == ["a.mkv"]
+
+
+def test_a_video_shows_boxes_of_things_in_place_of_heat(tmp_path):
+    scene = painted_scene()
+    camera, (windows,) = scene.file.photos[0].camera, scene.things(["window"])
+    shots = [(camera, prompts, "", 1) for prompts in ([Prompt("window")], [])]
+    assert write_video(tmp_path / "a.mkv", scene, shots, things=True) == 2
+    boxed, plain = frames(tmp_path / "a.mkv", camera)
+    rendered = scene.render(camera)
+    meant = outlined(scene.splats, [windows], rendered.rendering)
+    boxes = (meant != rendered.pixels).any(2)
+    assert boxes.any()
+    assert np.abs(boxed - meant).mean() < 8 < np.abs(boxed - rendered.pixels)[boxes].mean()
+    assert np.abs(plain - rendered.pixels).mean() < 8
 
 
 def test_a_video_says_what_it_lacks(tmp_path, monkeypatch):
