@@ -63,8 +63,8 @@ class Photo(HasLens):
         _check_shape(tracked.name, path, size, (tracked.width, tracked.height))
         if tracked.lens.distorts and (share := _share_seen(tracked.lens)) < _LEAST_SEEN:
             raise UserError(
-                f"photo {tracked.name}: its lens bends so much that {share:.0%} of an undistorted view shows "
-                "the photo: its distortion is wrong. Undistort the photos with the program that made the model"
+                f"photo {tracked.name}: its lens bends so much that the photo fills {share:.0%} of an "
+                "undistorted view: its distortion is wrong. Undistort photos with what made the model"
             )
         return cls(tracked.name, path, mask_path, tracked.lens.resized(*size), tracked.quarter_turns)
 

@@ -10,7 +10,7 @@ from functools import partial
 import numpy as np
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from numpy import ndarray as Array
 from torch import Tensor
 
@@ -102,9 +102,11 @@ def things_of(scene: Answering, question: Question) -> list[Things]:
     sharp = [_sharpened(scene, relevancy, colors.cpu().numpy()) for relevancy in question.relevancy]
     peak = peaks(question.relevancy).tolist()  # a word below the lowest level names nothing here
     pieces: list[list[Piece]] = [[] for _ in sharp]
+    shown = dict[str, Int[Array, " m"]]()
     for views in _views(scene, torch.stack(sharp, 1)):
-        for found, shown, best in zip(pieces, views, peak, strict=True):
-            found += pieces_of(shown) if best > LEVELS[0] else []
+        for found, view, best in zip(pieces, views, peak, strict=True):
+            shown[view.photo] = view.rows
+            found += pieces_of(view) if best > LEVELS[0] else []
 
     def box(weight: Float[Array, " n"], one: Joined) -> Box:
         return upright_box(means[one.rows], weight[one.rows], axes)
@@ -114,7 +116,7 @@ def things_of(scene: Answering, question: Question) -> list[Things]:
         values = question.relevancy[i].double().cpu().numpy()
         weight = np.sqrt(mass) * values
         boxed = partial(box, weight)
-        whole = grown(join(pieces[i], weight, boxed), len(weight))
+        whole = grown(join(pieces[i], weight, boxed, shown), len(weight))
         parts = parted(whole, means @ axes[:2].T, weight, APART * scene.gap)
         joined = sorted(placed(parts, [boxed(part) for part in parts]), key=lambda one: -one.weight)
         seen = [one for one in without_crumbs(joined) if one.views >= VIEWS]

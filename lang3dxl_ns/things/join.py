@@ -10,12 +10,16 @@ from itertools import combinations, pairwise
 import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray as Array
-from scipy.sparse import coo_matrix
+from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.csgraph import connected_components
 
 from lang3dxl_ns.things.pieces import Piece
 from lang3dxl_ns.things.thing import Box
 
+AGREED = 0.6
+"""Intersection over union, by weight and of what both photos show, from which two pieces show the same."""
+PARTLY = 0.3
+"""Share of a piece's weight that another photo must show to agree with it."""
 SHARED = 0.35
 """Share of a piece's weight, or of a thing's, from which the two show the same."""
 SPLINTER = 0.25
@@ -31,10 +35,9 @@ OVER = 0.4
 """Level distance of two things, relative to their summed widths, up to which one stands over the other."""
 OVERLAP = 0.05
 """Intersection over union of two boxes from which they hold sides of one thing."""
-SLIM = 4.0
-"""Height, relative to its width, from which a thing is one with what stands on or below it."""
-STRAIGHT = 1.5
-"""Distance of the two from one plumb line, relative to the slim one's width, up to which they are one."""
+LIGHT_PART = 0.1
+"""Weight, relative to a thing's, below which what lies over or under it is its part: a minaret's tip, a foot
+below a tree."""
 ROUND = 0.5
 """Depth, relative to its width, from which a thing is one with what crowns it: a dome with its lantern."""
 CROWN = 0.5, 0.3
@@ -57,18 +60,54 @@ class Joined:
         return len({piece.photo for piece in self.votes})
 
 
-def join(pieces: Sequence[Piece], weight: Float[Array, " n"], box: Callable[[Joined], Box]) -> list[Joined]:
+def agreed(
+    pieces: Sequence[Piece], weight: Float[Array, " n"], shown: Mapping[str, Int[Array, " m"]]
+) -> set[Piece]:
+    """Return the pieces that show the same as a piece of another photo, as far as both photos show it. Heat
+    that breaks in two in a single photo does not make two things. `weight`: of each Gaussian, 0 and above;
+    `shown`: the Gaussians that each photo shows."""
+    numbers = {name: i for i, name in enumerate(shown)}
+    photo = np.array([numbers[piece.photo] for piece in pieces], int)
+    own = _table([piece.rows for piece in pieces], len(weight))
+    held = own.multiply(weight).tocsr()
+    seen = (held @ _table([*shown.values()], len(weight)).T).toarray()
+    common = (held @ own.T).tocoo()
+    a, b, both = common.row, common.col, common.data
+    enough = seen[a, photo[b]] >= PARTLY * np.asarray(held.sum(1))[a, 0]
+    same = both >= AGREED * (seen[a, photo[b]] + seen[b, photo[a]] - both)
+    return {pieces[i] for i in a[enough & same & (photo[a] != photo[b])]}
+
+
+def _table(rows: Sequence[Int[Array, " m"]], count: int) -> csr_matrix:
+    """Return a sparse matrix with a one for each Gaussian, of `count`, that each list holds."""
+    ends = np.cumsum([0, *map(len, rows)])
+    return csr_matrix((np.ones(ends[-1]), np.concatenate([*rows, []]).astype(int), ends), (len(rows), count))
+
+
+def join(
+    pieces: Sequence[Piece],
+    weight: Float[Array, " n"],
+    box: Callable[[Joined], Box],
+    shown: Mapping[str, Int[Array, " m"]],
+) -> list[Joined]:
     """Join the pieces of all views, from the finest resolution to the coarsest.
 
-    A piece founds a thing if its Gaussians are mostly free, confirms the thing that it shares most with, and
-    says nothing if it covers several things, which a finer view told apart, or if it is cut off and new. A
-    thing is one with the heavier one that most photos cover together with it (two sides of a tower), unless a
-    photo shows each alone, or shows both in two pieces and neither stands over the other (a spire and a
-    pinnacle). `weight`: of each Gaussian, 0 and above; `box`: of a thing.
+    A piece founds a thing if its Gaussians are mostly free and a piece of another photo shows the same. It
+    confirms the thing that it shares most with, and says nothing if it covers several things, which finer
+    views told apart, or if it is cut off and new. A thing is one with the heavier one that most photos cover
+    together with it (two sides of a tower), unless a photo shows each alone, or shows both in two pieces and
+    neither stands over the other (a spire and a pinnacle).
+
+    Args:
+        pieces: of all views, found by `pieces_of`.
+        weight: of each Gaussian, 0 and above.
+        box: function that finds a thing's box.
+        shown: the Gaussians that each photo shows.
     """
     owner, things = np.full(len(weight), -1), list[Joined]()
     # Photos that show a thing, and those that show two in one piece.
     seen = defaultdict[tuple[int, ...], set[str]](set)
+    known = agreed(pieces, weight, shown)
     for piece in sorted(pieces, key=lambda piece: (piece.cut, -piece.resolution)):
         owners, weights = owner[piece.rows], weight[piece.rows]
         owned, total = owners >= 0, weights.sum()
@@ -80,11 +119,11 @@ def join(pieces: Sequence[Piece], weight: Float[Array, " n"], box: Callable[[Joi
         single, nearest = len(covered) < 2, int(shared.argmax()) if things else -1
         same = things and single and (shared[nearest] > SHARED * total or shares[nearest] > SHARED)
         confirms = same and (shares[nearest] > SHARED or (not piece.cut and shares[nearest] >= SPLINTER))
-        founds = single and not same and not piece.cut and shared.sum() <= SHARED * total
+        free = single and not same and shared.sum() <= SHARED * total
         if confirms:
             things[nearest].votes.append(piece)
             covered = [nearest]
-        elif founds:
+        elif free and piece in known and not piece.cut:
             rows = piece.rows[~owned]
             owner[rows], covered = len(things), [len(things)]
             things.append(Joined(rows, float(weight[rows].sum()), [piece]))
@@ -160,19 +199,19 @@ def parted(
 
 
 def placed(things: Sequence[Joined], boxes: Sequence[Box]) -> list[Joined]:
-    """Unite things whose boxes overlap, slim things with what stands on or below them (a minaret's shaft, its
-    balcony and its tip), and deep things with what crowns them. `boxes` are the things' upright boxes."""
-    pairs = list[tuple[int, int]]()
+    """Unite things whose boxes overlap, things with what is far lighter and lies over or under them, no
+    further than they are high, and deep things with what crowns them. `boxes`: the things' upright boxes."""
+    pairs, weights = list[tuple[int, int]](), np.array([one.weight for one in things])
     centers, extents = (np.array([box[part] for box in boxes]).reshape(-1, 3) for part in (0, 2))
     for a, (center, axes, size) in enumerate(boxes):
         wide, apart, high = size[:2].max(), abs((centers - center) @ axes.T), (centers - center) @ axes[2]
         common = np.minimum((size + extents) / 2 - apart, np.minimum(size, extents)).clip(0).prod(1)
         overlap = common > OVERLAP * (size.prod() + extents.prod(1) - common)
         near = apart[:, 2] - (size[2] + extents[:, 2]) / 2 < size[2]
-        slim = (size[2] >= SLIM * wide) & (np.hypot(apart[:, 0], apart[:, 1]) < STRAIGHT * wide)
+        part = (apart[:, :2] < size[:2] / 2).all(1) & (weights < LIGHT_PART * weights[a])
         small = (extents[:, :2].max(1) < CROWN[0] * wide) & (apart[:, :2].max(1) < CROWN[1] * wide)
         crown = small & (size[:2].min() > ROUND * wide) & (high > 0)
-        found = np.flatnonzero(overlap | (near & (slim | crown))).tolist()
+        found = np.flatnonzero(overlap | (near & (part | crown))).tolist()
         pairs += [(a, b) for b in found if b != a]
     return _grouped(things, _groups(len(things), pairs))
 

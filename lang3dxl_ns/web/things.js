@@ -6,7 +6,7 @@ import { fitted } from "./like.js";
 import { BLUR, spreadAt } from "./pick.js";
 import { seenAt } from "./space.js";
 
-const { LEVELS, LEAST, PART, DEPTH, FILLED, SHARED, SPLINTER, VIEWS, CRUMB, OFTEN, OVER, OVERLAP, OUTLIERS, COLORED, APART, PRESENT, TOLD, SLIM, STRAIGHT, ROUND, CROWN, LIGHT, PLACES, SHOWN } = language.things;
+const { LEVELS, LEAST, PART, DEPTH, FILLED, AGREED, PARTLY, SHARED, SPLINTER, VIEWS, CRUMB, OFTEN, OVER, OVERLAP, OUTLIERS, COLORED, APART, PRESENT, TOLD, LIGHT_PART, ROUND, CROWN, LIGHT, PLACES, SHOWN } = language.things;
 const SIDE = 256; // pixels of a view's longer side
 const FIELDS = 10, MOST_KEPT = 5e5; // of an ellipse; ellipses of all views, 80 bytes each
 const HIDDEN = 1e-3; // of a pixel's light: what lies behind is not seen
@@ -23,7 +23,13 @@ export function thingsOf(views, scene, relevancy, taught, better) {
   const heat = sharpened(scene, relevancy), { mass } = scene;
   const weight = Float64Array.from(relevancy, (value, i) => Math.sqrt(mass[i]) * value);
   const box = ({ rows }) => uprightBox(rows, scene.centers, weight, scene.edges);
-  const whole = grown(join(views.flatMap((view, v) => piecesOf(drawn(view, scene, heat), v)), weight, box), weight.length);
+  const shown = views.map(() => new Uint8Array(weight.length));
+  const pieces = views.flatMap((view, v) => {
+    const map = drawn(view, scene, heat);
+    map.rows.forEach((i, k) => (shown[v][i] = map.points[3 * k + 2] > 0));
+    return piecesOf(map, v);
+  });
+  const whole = grown(join(pieces, weight, box, shown), weight.length);
   const level = (i) => scene.edges.slice(0, 2).map((axis) => axis.reduce((sum, value, k) => sum + value * scene.centers[3 * i + k], 0));
   const parts = parted(whole, level, weight, APART * scene.gap);
   const joined = placed(parts, parts.map(box));
@@ -260,9 +266,24 @@ export function split(map, width, height) {
 
 // ── things ──
 
+/** Find the pieces that another view's agrees with: see things/join.py. shown: which Gaussians each view shows. */
+function agreed(pieces, weight, shown) {
+  const holders = new Map(), sum = (rows, of = () => 1) => rows.reduce((all, i) => all + of(i) * weight[i], 0);
+  pieces.forEach(({ rows }, p) => rows.forEach((i) => (holders.get(i) ?? holders.set(i, []).get(i)).push(p)));
+  const seen = pieces.map(({ rows }) => shown.map((one) => sum(rows, (i) => one[i])));
+  return new Set(
+    pieces.filter(({ rows, view }, a) => {
+      const common = new Map(), total = sum(rows);
+      for (const i of rows) for (const b of holders.get(i)) if (pieces[b].view !== view) common.set(b, (common.get(b) ?? 0) + weight[i]);
+      const agrees = ([b, both]) => both >= AGREED * (seen[a][pieces[b].view] + seen[b][view] - both) && seen[a][pieces[b].view] >= PARTLY * total;
+      return [...common].some(agrees);
+    }),
+  );
+}
+
 /** Join the pieces of all views, from the finest resolution to the coarsest: see things/join.py. */
-export function join(pieces, weight, box) {
-  const owner = new Int32Array(weight.length).fill(-1), things = [], together = new Map();
+export function join(pieces, weight, box, shown) {
+  const owner = new Int32Array(weight.length).fill(-1), things = [], together = new Map(), known = agreed(pieces, weight, shown);
   for (const piece of [...pieces].sort((a, b) => a.cut - b.cut || b.resolution - a.resolution)) {
     const shared = new Map();
     let total = 0, taken = 0;
@@ -280,7 +301,7 @@ export function join(pieces, weight, box) {
       for (const a of covered) for (const b of covered) if (a < b) together.set(`${a} ${b}`, (together.get(`${a} ${b}`) ?? new Set()).add(piece.view));
     } else if (best >= 0 && (most > SHARED * total || share > SHARED)) {
       if (share >= SPLINTER && !(piece.cut && share <= SHARED)) things[(covered = [best])[0]].votes.push(piece);
-    } else if (!piece.cut && taken <= SHARED * total) {
+    } else if (known.has(piece) && !piece.cut && taken <= SHARED * total) {
       const rows = piece.rows.filter((i) => owner[i] < 0);
       for (const i of rows) owner[i] = things.length;
       covered = [things.length];
@@ -347,7 +368,7 @@ export function parted(things, level, weight, space) {
   });
 }
 
-/** Unite things whose boxes overlap, slim ones with what stands on or below them, deep ones with what crowns them. */
+/** Unite things whose boxes overlap, heavy ones with what is light over or under them, deep ones with what crowns them. */
 export function placed(things, boxes) {
   const pairs = [], volume = (size) => size.reduce((all, side) => all * side, 1), wide = ([x, y]) => Math.max(x, y);
   boxes.forEach(({ center, axes, size }, a) => {
@@ -356,9 +377,9 @@ export function placed(things, boxes) {
       const [x, y, high] = axes.map((axis) => axis.reduce((sum, value, k) => sum + value * (other.center[k] - center[k]), 0));
       const common = volume([x, y, high].map((far, k) => Math.max(0, Math.min((size[k] + other.size[k]) / 2 - Math.abs(far), size[k], other.size[k]))));
       const overlap = common > OVERLAP * (volume(size) + volume(other.size) - common), near = Math.abs(high) - (size[2] + other.size[2]) / 2 < size[2];
-      const slim = size[2] >= SLIM * width && Math.hypot(x, y) < STRAIGHT * width;
+      const part = Math.abs(x) < size[0] / 2 && Math.abs(y) < size[1] / 2 && things[b].weight < LIGHT_PART * things[a].weight;
       const small = wide(other.size) < CROWN[0] * width && wide([Math.abs(x), Math.abs(y)]) < CROWN[1] * width;
-      if (a !== b && (overlap || (near && (slim || (small && Math.min(size[0], size[1]) > ROUND * width && high > 0))))) pairs.push([a, b]);
+      if (a !== b && (overlap || (near && (part || (small && Math.min(size[0], size[1]) > ROUND * width && high > 0))))) pairs.push([a, b]);
     });
   });
   return grouped(things, pairs);

@@ -38,10 +38,15 @@ def piece(photo: str, rows, resolution: float, cut: bool = False) -> Piece:
     return Piece(photo, np.array(rows), resolution, len(rows), (0, 0, 9, 9), cut)
 
 
-def joined(pieces, places=range(300)) -> list[Joined]:
-    """Join pieces of Gaussians of equal weight at these places along x."""
+def joined(pieces, places=range(300), shown=None) -> list[Joined]:
+    """Join pieces of Gaussians of equal weight at these places along x. `shown`: by photo, if more than what
+    its pieces hold."""
     points, weight = np.outer(places, (1.0, 0, 0)), np.ones(len(places))
-    return join(pieces, weight, lambda one: upright_box(points[one.rows], weight[one.rows], np.eye(3)))
+    held = {
+        one.photo: np.unique([i for p in pieces if p.photo == one.photo for i in p.rows]) for one in pieces
+    }
+    boxed = lambda one: upright_box(points[one.rows], weight[one.rows], np.eye(3))  # noqa: E731
+    return join(pieces, weight, boxed, held | (shown or {}))
 
 
 def test_a_region_splits_where_it_falls_apart_and_only_there():
@@ -72,16 +77,31 @@ def test_a_coarse_view_does_not_join_what_a_fine_one_tells_apart():
 
 
 def test_sides_that_no_photo_shows_apart_are_one_thing():
-    sides = [piece("a", [0, 1, 2], 9.0), piece("b", [3, 4, 5], 9.0)]
+    sides = [piece(p, rows, 9.0) for pair, rows in (("ab", [0, 1, 2]), ("cd", [3, 4, 5])) for p in pair]
     assert len(joined(sides)) == 2
-    (one,) = joined([*sides, piece("c", range(6), 1.0)])
+    (one,) = joined([*sides, piece("e", range(6), 1.0)])
     assert sorted(one.rows.tolist()) == list(range(6))
+
+
+def test_heat_that_breaks_in_two_in_one_photo_makes_no_two_things():
+    halves = [piece("a", range(5), 9.0), piece("a", range(5, 10), 9.0)]
+    whole = [piece(p, range(10), 1.0) for p in "bcd"]
+    (one,) = joined([*halves, *whole])
+    assert sorted(one.rows.tolist()) == list(range(10))
+    assert len(joined([*halves, *whole, piece("e", range(5), 9.0), piece("e", range(5, 10), 9.0)])) == 2
+
+
+def test_photos_agree_as_far_as_both_show_a_thing():
+    sides = [piece("a", range(10), 9.0), piece("b", range(5, 15), 8.0)]
+    assert [one.views for one in joined(sides)] == [2]
+    assert not joined(sides, shown={p: np.arange(15) for p in "ab"})  # where each would show all of it
+    assert not joined([sides[0], piece("b", range(8, 18), 8.0)])  # too little in common
 
 
 @pytest.mark.parametrize("beside", [True, False])
 def test_what_stands_beside_is_another_thing_where_a_photo_has_them_in_two_pieces(beside):
     spire, pinnacle, other = range(10), range(10, 15), range(15, 25)
-    alone = [piece(p, rows, 9.0) for p, rows in zip("abc", (spire, pinnacle, other), strict=True)]
+    alone = [piece(p, rows, 9.0) for p, rows in zip("abcghi", (spire, pinnacle, other) * 2, strict=True)]
     both = [piece("d", [*spire, *pinnacle], 1.0), piece("e", [*spire, *pinnacle], 1.0)]
     # This photo has the spire and what is behind it in one piece, and the pinnacle in another.
     apart = [piece("f", [*spire, *other], 1.0), piece("f", pinnacle, 1.0)]
@@ -116,7 +136,7 @@ def test_a_thing_gets_the_gaussians_that_most_of_its_pieces_show():
 
 def test_crumbs_go_and_equals_stay():
     sizes = [np.arange(100), np.arange(100, 200), np.arange(200, 202)]
-    found = without_crumbs(joined([piece("a", rows, 1.0) for rows in sizes]))
+    found = without_crumbs(joined([piece(p, rows, 1.0) for p in "ab" for rows in sizes]))
     assert [len(one.rows) for one in found] == [100, 100]
     assert without_crumbs([]) == []
 
@@ -411,13 +431,19 @@ def test_what_an_empty_strip_separates_is_a_thing_of_its_own_unless_it_is_wide()
 
 
 def test_things_are_one_where_their_boxes_overlap_or_one_stands_on_the_other():
-    def joined(*boxes):
-        parts = [Joined(np.array([i]), 1.0, [piece("a", [i], 1.0)]) for i in range(len(boxes))]
+    def joined(*boxes, others: float = 1.0):
+        """others: weight of all but the first."""
+        parts = [
+            Joined(np.array([i]), others if i else 1.0, [piece("a", [i], 1.0)]) for i in range(len(boxes))
+        ]
         placed_at = [(np.array((x, y, z)), np.eye(3), np.array(size, float)) for x, y, z, size in boxes]
         return sorted(sorted(one.rows.tolist()) for one in placed(parts, placed_at))
 
-    shaft, tip, far = (0, 0, 0, (1, 1, 9)), (0.5, 0, 7, (1, 1, 2)), (0, 0, 40, (1, 1, 2))
-    assert joined(shaft, tip, (9, 0, 7, (1, 1, 2)), far) == [[0, 1], [2], [3]]
+    places = (0, 0), (0.4, 3), (0, -3), (0.6, 3), (0, 5)
+    shaft, tip, foot, beside, far = ((x, 0, z, (1, 1, 2)) for x, z in places)
+    assert joined(shaft, tip, foot, far, others=0.09) == [[0, 1, 2], [3]]
+    assert joined(shaft, beside, others=0.09) == [[0], [1]]
+    assert joined(shaft, tip, others=0.11) == [[0], [1]]
     assert joined((0, 0, 0, (1, 0.2, 2)), (0, 0, 3, (1, 0.2, 2))) == [[0], [1]]  # windows in tiers
     dome, side, lantern = (0, 0, 0, (4, 3, 2)), (1, 1, 0, (3, 4, 2)), (0.5, 0.5, 2, (1, 1, 1))
     assert joined(dome, side) == joined(dome, lantern) == [[0, 1]]

@@ -285,16 +285,19 @@ def test_pieces_join_as_in_python(page):
     def box(one: Joined):
         return upright_box(points[one.rows], weight[one.rows], np.eye(3))
 
-    expected = grown(without_crumbs(join(pieces, weight, box)), 400)
+    shown = [np.flatnonzero(rng.random(400) < 0.9) for _ in range(9)]
+    expected = grown(
+        without_crumbs(join(pieces, weight, box, {str(v): rows for v, rows in enumerate(shown)})), 400
+    )
     given = [{"view": int(p.photo), "rows": p.rows.tolist(), "resolution": p.resolution, "cut": p.cut}
              for p in pieces]  # fmt: skip
     body = """const edges = [[1, 0, 0], [0, 1, 0], [0, 0, 1]];
       const box = ({ rows }) => m.uprightBox(rows, given.points, given.weight, edges);
-      return m.grown(m.withoutCrumbs(m.join(given.pieces, given.weight, box)), 400).map(
+      const shown = given.shown.map((rows) => Uint8Array.from(given.weight, (_, i) => rows.includes(i)));
+      return m.grown(m.withoutCrumbs(m.join(given.pieces, given.weight, box, shown)), 400).map(
       ({ rows, votes }) => [rows.toSorted((a, b) => a - b), new Set(votes.map(({ view }) => view)).size]);"""
-    found = module(
-        page, "things", body, {"pieces": given, "weight": weight.tolist(), "points": points.ravel().tolist()}
-    )
+    told = {"pieces": given, "weight": weight.tolist(), "points": points.ravel().tolist()}
+    found = module(page, "things", body, told | {"shown": [rows.tolist() for rows in shown]})
     assert len(found) > 5
     assert sorted(found) == sorted([sorted(one.rows.tolist()), one.views] for one in expected)
 
@@ -330,11 +333,12 @@ def test_things_join_with_those_on_or_around_them_as_in_python(page, least, most
     rng = np.random.default_rng(4)
     count = 40
     boxes = [(rng.uniform(0, 9, 3), np.eye(3), rng.uniform(least, most)) for _ in range(count)]
-    parts = [Joined(np.array([i]), 1.0, []) for i in range(count)]
+    weights = rng.choice([1.0, 0.01], count)
+    parts = [Joined(np.array([i]), weight, []) for i, weight in enumerate(weights)]
     expected = sorted(sorted(one.rows.tolist()) for one in placed(parts, boxes))
     assert 5 < len(expected) < count
     given = {
-        "parts": [{"rows": [i], "weight": 1, "votes": []} for i in range(count)],
+        "parts": [{"rows": [i], "weight": w, "votes": []} for i, w in enumerate(weights.tolist())],
         "boxes": [
             dict(zip(("center", "axes", "size"), map(np.ndarray.tolist, box), strict=True)) for box in boxes
         ],
