@@ -31,8 +31,6 @@ if TYPE_CHECKING:
 
 _LARGE = 1_500_000
 """Pixels of a file above which the JPEG decoder shrinks it: in half of the time, 50 dB from exact."""
-
-
 _LEAST_SEEN = 0.1
 """Share of a pinhole's view that a photo must have. Wide lenses leave about half."""
 

@@ -63,11 +63,8 @@ _SUGGESTED = (
 _NUMBERS = (
     ("ranking", view_ranking, "PEAK LARGE RIM STRONG"),
     ("things", pieces, "LEVELS LEAST PART DEPTH FILLED"),
-    (
-        "things",
-        join,
-        "AGREED PARTLY SHARED SPLINTER VIEWS CRUMB OFTEN OVER OVERLAP LIGHT_PART ROUND CROWN",
-    ),
+    ("things", join, "AGREED PARTLY SHARED SPLINTER VIEWS CRUMB OFTEN"),
+    ("things", join, "OVER OVERLAP LIGHT_PART ROUND CROWN"),
     ("things", thing, "OUTLIERS"),
     ("things", find, "COLORED APART PRESENT TOLD SURE MISSED"),
     ("things", outlines, "LIGHT PLACES SHOWN"),
