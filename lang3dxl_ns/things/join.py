@@ -35,9 +35,13 @@ OVER = 0.4
 """Level distance of two things, relative to their summed widths, up to which one stands over the other."""
 OVERLAP = 0.05
 """Intersection over union of two boxes from which they hold sides of one thing."""
+SLIM = 4.0
+"""Height, relative to its width, from which a thing is one with what stands on or below it."""
+STRAIGHT = 1.5
+"""Distance of the two from one plumb line, relative to the slim one's width, up to which they are one."""
 LIGHT_PART = 0.1
-"""Weight, relative to a thing's, below which what lies over or under it is its part: a minaret's tip, a foot
-below a tree."""
+"""Weight, relative to a thing's, below which what lies over or under it is its part: a tower's foot below a
+tree."""
 ROUND = 0.5
 """Depth, relative to its width, from which a thing is one with what crowns it: a dome with its lantern."""
 CROWN = 0.5, 0.3
@@ -199,8 +203,9 @@ def parted(
 
 
 def placed(things: Sequence[Joined], boxes: Sequence[Box]) -> list[Joined]:
-    """Unite things whose boxes overlap, things with what is far lighter and lies over or under them, no
-    further than they are high, and deep things with what crowns them. `boxes`: the things' upright boxes."""
+    """Unite things whose boxes overlap, slim things with what stands on or below them (a minaret's shaft, its
+    balcony and its tip), things with what is far lighter over or below them, and deep things with what crowns
+    them. `boxes` are the things' upright boxes."""
     pairs, weights = list[tuple[int, int]](), np.array([one.weight for one in things])
     centers, extents = (np.array([box[part] for box in boxes]).reshape(-1, 3) for part in (0, 2))
     for a, (center, axes, size) in enumerate(boxes):
@@ -208,10 +213,11 @@ def placed(things: Sequence[Joined], boxes: Sequence[Box]) -> list[Joined]:
         common = np.minimum((size + extents) / 2 - apart, np.minimum(size, extents)).clip(0).prod(1)
         overlap = common > OVERLAP * (size.prod() + extents.prod(1) - common)
         near = apart[:, 2] - (size[2] + extents[:, 2]) / 2 < size[2]
+        slim = (size[2] >= SLIM * wide) & (np.hypot(apart[:, 0], apart[:, 1]) < STRAIGHT * wide)
         part = (apart[:, :2] < size[:2] / 2).all(1) & (weights < LIGHT_PART * weights[a])
         small = (extents[:, :2].max(1) < CROWN[0] * wide) & (apart[:, :2].max(1) < CROWN[1] * wide)
         crown = small & (size[:2].min() > ROUND * wide) & (high > 0)
-        found = np.flatnonzero(overlap | (near & (part | crown))).tolist()
+        found = np.flatnonzero(overlap | (near & (slim | part | crown))).tolist()
         pairs += [(a, b) for b in found if b != a]
     return _grouped(things, _groups(len(things), pairs))
 

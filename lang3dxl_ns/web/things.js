@@ -6,7 +6,7 @@ import { fitted } from "./like.js";
 import { BLUR, spreadAt } from "./pick.js";
 import { seenAt } from "./space.js";
 
-const { LEVELS, LEAST, PART, DEPTH, FILLED, AGREED, PARTLY, SHARED, SPLINTER, VIEWS, CRUMB, OFTEN, OVER, OVERLAP, OUTLIERS, COLORED, APART, PRESENT, TOLD, LIGHT_PART, ROUND, CROWN, LIGHT, PLACES, SHOWN } = language.things;
+const { LEVELS, LEAST, PART, DEPTH, FILLED, AGREED, PARTLY, SHARED, SPLINTER, VIEWS, CRUMB, OFTEN, OVER, OVERLAP, OUTLIERS, COLORED, APART, PRESENT, TOLD, SLIM, STRAIGHT, LIGHT_PART, ROUND, CROWN, LIGHT, PLACES, SHOWN } = language.things;
 const SIDE = 256; // pixels of a view's longer side
 const FIELDS = 10, MOST_KEPT = 5e5; // of an ellipse; ellipses of all views, 80 bytes each
 const HIDDEN = 1e-3; // of a pixel's light: what lies behind is not seen
@@ -368,7 +368,8 @@ export function parted(things, level, weight, space) {
   });
 }
 
-/** Unite things whose boxes overlap, heavy ones with what is light over or under them, deep ones with what crowns them. */
+/** Unite things whose boxes overlap, slim ones with what stands on or below them, any with what is far lighter there, deep ones with what
+ * crowns them. */
 export function placed(things, boxes) {
   const pairs = [], volume = (size) => size.reduce((all, side) => all * side, 1), wide = ([x, y]) => Math.max(x, y);
   boxes.forEach(({ center, axes, size }, a) => {
@@ -377,9 +378,10 @@ export function placed(things, boxes) {
       const [x, y, high] = axes.map((axis) => axis.reduce((sum, value, k) => sum + value * (other.center[k] - center[k]), 0));
       const common = volume([x, y, high].map((far, k) => Math.max(0, Math.min((size[k] + other.size[k]) / 2 - Math.abs(far), size[k], other.size[k]))));
       const overlap = common > OVERLAP * (volume(size) + volume(other.size) - common), near = Math.abs(high) - (size[2] + other.size[2]) / 2 < size[2];
+      const slim = size[2] >= SLIM * width && Math.hypot(x, y) < STRAIGHT * width;
       const part = Math.abs(x) < size[0] / 2 && Math.abs(y) < size[1] / 2 && things[b].weight < LIGHT_PART * things[a].weight;
       const small = wide(other.size) < CROWN[0] * width && wide([Math.abs(x), Math.abs(y)]) < CROWN[1] * width;
-      if (a !== b && (overlap || (near && (part || (small && Math.min(size[0], size[1]) > ROUND * width && high > 0))))) pairs.push([a, b]);
+      if (a !== b && (overlap || (near && (slim || part || (small && Math.min(size[0], size[1]) > ROUND * width && high > 0))))) pairs.push([a, b]);
     });
   });
   return grouped(things, pairs);

@@ -64,7 +64,7 @@ _NUMBERS = (
     ("ranking", view_ranking, "PEAK LARGE RIM STRONG"),
     ("things", pieces, "LEVELS LEAST PART DEPTH FILLED"),
     ("things", join, "AGREED PARTLY SHARED SPLINTER VIEWS CRUMB OFTEN"),
-    ("things", join, "OVER OVERLAP LIGHT_PART ROUND CROWN"),
+    ("things", join, "OVER OVERLAP SLIM STRAIGHT LIGHT_PART ROUND CROWN"),
     ("things", thing, "OUTLIERS"),
     ("things", find, "COLORED APART PRESENT TOLD SURE MISSED"),
     ("things", outlines, "LIGHT PLACES SHOWN"),

@@ -439,11 +439,13 @@ def test_things_are_one_where_their_boxes_overlap_or_one_stands_on_the_other():
         placed_at = [(np.array((x, y, z)), np.eye(3), np.array(size, float)) for x, y, z, size in boxes]
         return sorted(sorted(one.rows.tolist()) for one in placed(parts, placed_at))
 
+    shaft, tip, far = (0, 0, 0, (1, 1, 9)), (0.5, 0, 7, (1, 1, 2)), (0, 0, 40, (1, 1, 2))
+    assert joined(shaft, tip, (9, 0, 7, (1, 1, 2)), far) == [[0, 1], [2], [3]]
     places = (0, 0), (0.4, 3), (0, -3), (0.6, 3), (0, 5)
-    shaft, tip, foot, beside, far = ((x, 0, z, (1, 1, 2)) for x, z in places)
-    assert joined(shaft, tip, foot, far, others=0.09) == [[0, 1, 2], [3]]
-    assert joined(shaft, beside, others=0.09) == [[0], [1]]
-    assert joined(shaft, tip, others=0.11) == [[0], [1]]
+    trunk, tip, foot, beside, far = ((x, 0, z, (1, 1, 2)) for x, z in places)
+    assert joined(trunk, tip, foot, far, others=0.09) == [[0, 1, 2], [3]]
+    assert joined(trunk, beside, others=0.09) == [[0], [1]]
+    assert joined(trunk, tip, others=0.11) == [[0], [1]]
     assert joined((0, 0, 0, (1, 0.2, 2)), (0, 0, 3, (1, 0.2, 2))) == [[0], [1]]  # windows in tiers
     dome, side, lantern = (0, 0, 0, (4, 3, 2)), (1, 1, 0, (3, 4, 2)), (0.5, 0.5, 2, (1, 1, 1))
     assert joined(dome, side) == joined(dome, lantern) == [[0, 1]]
