@@ -10,7 +10,7 @@ from itertools import combinations, pairwise
 import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray as Array
-from scipy.sparse import coo_matrix, csr_matrix
+from scipy.sparse import coo_matrix, csc_matrix, csr_matrix
 from scipy.sparse.csgraph import connected_components
 
 from lang3dxl_ns.things.pieces import Piece
@@ -64,28 +64,38 @@ class Joined:
         return len({piece.photo for piece in self.votes})
 
 
-def agreed(
+def agreement(
     pieces: Sequence[Piece], weight: Float[Array, " n"], shown: Mapping[str, Int[Array, " m"]]
-) -> set[Piece]:
-    """Return the pieces that show the same as a piece of another photo, as far as both photos show it. Heat
-    that breaks in two in a single photo does not make two things. `weight`: of each Gaussian, 0 and above;
-    `shown`: the Gaussians that each photo shows."""
+) -> Callable[[int], bool]:
+    """Return a function that tells of a piece, by its number, whether a piece of another photo shows the same
+    as far as both photos show it. Heat that breaks in two in a single photo does not make two things.
+    `weight`: of each Gaussian, 0 and above; `shown`: the Gaussians that each photo shows."""
     numbers = {name: i for i, name in enumerate(shown)}
     photo = np.array([numbers[piece.photo] for piece in pieces], int)
-    own = _table([piece.rows for piece in pieces], len(weight))
-    held = own.multiply(weight).tocsr()
-    seen = (held @ _table([*shown.values()], len(weight)).T).toarray()
-    common = (held @ own.T).tocoo()
-    a, b, both = common.row, common.col, common.data
-    enough = seen[a, photo[b]] >= PARTLY * np.asarray(held.sum(1))[a, 0]
-    same = both >= AGREED * (seen[a, photo[b]] + seen[b, photo[a]] - both)
-    return {pieces[i] for i in a[enough & same & (photo[a] != photo[b])]}
+    showing = _table([*shown.values()], len(weight))
+    holding = _table([piece.rows for piece in pieces], len(weight))
+
+    def seen(number: int) -> Float[Array, " v"]:
+        """Weigh what each photo shows of a piece."""
+        rows = pieces[number].rows
+        return showing[:, rows] @ weight[rows]
+
+    def agrees(number: int) -> bool:
+        rows = pieces[number].rows
+        common, own = holding[:, rows] @ weight[rows], seen(number)[photo]
+        likely = (own >= PARTLY * weight[rows].sum()) & (common >= AGREED * own) & (photo != photo[number])
+        return any(
+            common[i] >= AGREED * (own[i] + seen(i)[photo[number]] - common[i])
+            for i in np.flatnonzero(likely).tolist()
+        )
+
+    return agrees
 
 
-def _table(rows: Sequence[Int[Array, " m"]], count: int) -> csr_matrix:
+def _table(lists: Sequence[Int[Array, " m"]], count: int) -> csc_matrix:
     """Return a sparse matrix with a one for each Gaussian, of `count`, that each list holds."""
-    ends = np.cumsum([0, *map(len, rows)])
-    return csr_matrix((np.ones(ends[-1]), np.concatenate([*rows, []]).astype(int), ends), (len(rows), count))
+    ends, rows = np.cumsum([0, *map(len, lists)]), np.concatenate([*lists, []]).astype(int)
+    return csr_matrix((np.ones(len(rows)), rows, ends), (len(lists), count)).tocsc()
 
 
 def join(
@@ -111,8 +121,8 @@ def join(
     owner, things = np.full(len(weight), -1), list[Joined]()
     # Photos that show a thing, and those that show two in one piece.
     seen = defaultdict[tuple[int, ...], set[str]](set)
-    known = agreed(pieces, weight, shown)
-    for piece in sorted(pieces, key=lambda piece: (piece.cut, -piece.resolution)):
+    agrees = agreement(pieces, weight, shown)
+    for number, piece in sorted(enumerate(pieces), key=lambda one: (one[1].cut, -one[1].resolution)):
         owners, weights = owner[piece.rows], weight[piece.rows]
         owned, total = owners >= 0, weights.sum()
         if total <= 0:
@@ -127,7 +137,7 @@ def join(
         if confirms:
             things[nearest].votes.append(piece)
             covered = [nearest]
-        elif free and piece in known and not piece.cut:
+        elif free and not piece.cut and agrees(number):
             rows = piece.rows[~owned]
             owner[rows], covered = len(things), [len(things)]
             things.append(Joined(rows, float(weight[rows].sum()), [piece]))

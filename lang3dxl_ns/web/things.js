@@ -23,13 +23,8 @@ export function thingsOf(views, scene, relevancy, taught, better) {
   const heat = sharpened(scene, relevancy), { mass } = scene;
   const weight = Float64Array.from(relevancy, (value, i) => Math.sqrt(mass[i]) * value);
   const box = ({ rows }) => uprightBox(rows, scene.centers, weight, scene.edges);
-  const shown = views.map(() => new Uint8Array(weight.length));
-  const pieces = views.flatMap((view, v) => {
-    const map = drawn(view, scene, heat);
-    map.rows.forEach((i, k) => (shown[v][i] = map.points[3 * k + 2] > 0));
-    return piecesOf(map, v);
-  });
-  const whole = grown(join(pieces, weight, box, shown), weight.length);
+  const pieces = views.flatMap((view, v) => piecesOf(drawn(view, scene, heat), v));
+  const whole = grown(join(pieces, weight, box, (v, i) => isFilledBy(views[v], i)), weight.length);
   const level = (i) => scene.edges.slice(0, 2).map((axis) => axis.reduce((sum, value, k) => sum + value * scene.centers[3 * i + k], 0));
   const parts = parted(whole, level, weight, APART * scene.gap);
   const joined = placed(parts, parts.map(box));
@@ -266,24 +261,35 @@ export function split(map, width, height) {
 
 // ── things ──
 
-/** Find the pieces that another view's agrees with: see things/join.py. shown: which Gaussians each view shows. */
-function agreed(pieces, weight, shown) {
-  const holders = new Map(), sum = (rows, of = () => 1) => rows.reduce((all, i) => all + of(i) * weight[i], 0);
-  pieces.forEach(({ rows }, p) => rows.forEach((i) => (holders.get(i) ?? holders.set(i, []).get(i)).push(p)));
-  const seen = pieces.map(({ rows }) => shown.map((one) => sum(rows, (i) => one[i])));
-  return new Set(
-    pieces.filter(({ rows, view }, a) => {
-      const common = new Map(), total = sum(rows);
-      for (const i of rows) for (const b of holders.get(i)) if (pieces[b].view !== view) common.set(b, (common.get(b) ?? 0) + weight[i]);
-      const agrees = ([b, both]) => both >= AGREED * (seen[a][pieces[b].view] + seen[b][view] - both) && seen[a][pieces[b].view] >= PARTLY * total;
-      return [...common].some(agrees);
-    }),
-  );
+/** Return a function that tells whether a piece of another view shows the same as a piece: see things/join.py. shows: tells
+ * whether a view shows a Gaussian. */
+function agreement(pieces, weight, shows) {
+  const holders = new Map(), sum = (rows) => rows.reduce((all, i) => all + weight[i], 0);
+  for (const piece of pieces) for (const i of piece.rows) (holders.get(i) ?? holders.set(i, []).get(i)).push(piece);
+  return ({ rows, view }) => {
+    const common = new Map(), total = sum(rows);
+    for (const i of rows) for (const other of holders.get(i)) if (other.view !== view) common.set(other, (common.get(other) ?? 0) + weight[i]);
+    return [...common].some(([other, both]) => {
+      const seen = sum(rows.filter((i) => shows(other.view, i)));
+      return seen >= PARTLY * total && both >= AGREED * (seen + sum(other.rows.filter((i) => shows(view, i))) - both);
+    });
+  };
+}
+
+/** Whether a Gaussian fills enough of a view to belong to its pieces. */
+function isFilledBy({ rows, codes, sizes, width, height }, i) {
+  let [first, end] = [0, rows.length];
+  while (first < end) {
+    const middle = (first + end) >> 1;
+    if (rows[middle] < i) first = middle + 1;
+    else end = middle;
+  }
+  return rows[first] === i && sizes[codes[first]] * width * height >= FILLED;
 }
 
 /** Join the pieces of all views, from the finest resolution to the coarsest: see things/join.py. */
-export function join(pieces, weight, box, shown) {
-  const owner = new Int32Array(weight.length).fill(-1), things = [], together = new Map(), known = agreed(pieces, weight, shown);
+export function join(pieces, weight, box, shows) {
+  const owner = new Int32Array(weight.length).fill(-1), things = [], together = new Map(), agrees = agreement(pieces, weight, shows);
   for (const piece of [...pieces].sort((a, b) => a.cut - b.cut || b.resolution - a.resolution)) {
     const shared = new Map();
     let total = 0, taken = 0;
@@ -301,7 +307,7 @@ export function join(pieces, weight, box, shown) {
       for (const a of covered) for (const b of covered) if (a < b) together.set(`${a} ${b}`, (together.get(`${a} ${b}`) ?? new Set()).add(piece.view));
     } else if (best >= 0 && (most > SHARED * total || share > SHARED)) {
       if (share >= SPLINTER && !(piece.cut && share <= SHARED)) things[(covered = [best])[0]].votes.push(piece);
-    } else if (known.has(piece) && !piece.cut && taken <= SHARED * total) {
+    } else if (!piece.cut && taken <= SHARED * total && agrees(piece)) {
       const rows = piece.rows.filter((i) => owner[i] < 0);
       for (const i of rows) owner[i] = things.length;
       covered = [things.length];

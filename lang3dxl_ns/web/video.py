@@ -77,8 +77,10 @@ def _camera(stand: Float64[Array, "7"], up: Float64[Array, "3"], size: tuple[int
 
 def write_video(path: Path, scene: Scene, shots: Sequence[Shot], things: bool = False) -> int:
     """Write a video in the format that the name's ending tells, and return the number of pictures. things:
-    draw numbered boxes of what prompts name in place of heat. Raises UserError without ffmpeg, or if it can't
-    write the file."""
+    draw numbered boxes of what prompts name in place of heat. Raises UserError without ffmpeg, if it can't
+    write the file, and for things without a prompt."""
+    if things and not any(prompts for _, prompts, *_ in shots):
+        raise UserError("no stop of the tour has a word whose things could be shown: leave --things off")
     if shutil.which("ffmpeg") is None:
         raise UserError("a video needs ffmpeg: apt install ffmpeg, or conda install ffmpeg")
     first, path = shots[0][0], expanded(path).absolute()

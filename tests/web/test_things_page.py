@@ -271,7 +271,7 @@ def test_pieces_join_as_in_python(page):
             rows = np.unique(rng.integers(start, min(start + wide, 200), 30))
             cut = bool(rng.random() < 0.1)
             pieces.append(Piece(str(view), rows, float(rng.random()), len(rows), (0, 0, 1, 1), cut))
-    weight, points = rng.random(400), rng.random((400, 3))
+    weight, points = rng.random(500), rng.random((500, 3))
     # Two that photos have in one piece, and another in two, are one where one stands over the other.
     for start in range(200, 400, 10):
         spire, pinnacle, other = (range(start + a, start + b) for a, b in ((0, 4), (4, 7), (7, 10)))
@@ -282,22 +282,28 @@ def test_pieces_join_as_in_python(page):
             fine = 9.0 if photo < "3" else 0.5
             pieces.append(Piece(photo, np.array(rows), fine, len(rows), (0, 0, 1, 1), False))
 
+    # Of these, two photos have little in common.
+    for start in range(400, 500, 20):
+        for photo, first in (("0", start), ("7", start + 7)):
+            pieces.append(Piece(photo, np.arange(first, first + 10), 9.0, 9, (0, 0, 1, 1), False))
+
     def box(one: Joined):
         return upright_box(points[one.rows], weight[one.rows], np.eye(3))
 
-    shown = [np.flatnonzero(rng.random(400) < rng.choice([0.2, 0.9])) for _ in range(9)]
-    expected = grown(
-        without_crumbs(join(pieces, weight, box, {str(v): rows for v, rows in enumerate(shown)})), 400
-    )
+    shown = {}
+    for view in map(str, range(9)):
+        own = [p.rows for p in pieces if p.photo == view]
+        shown[view] = np.unique(np.concatenate([*own, rng.choice(400, rng.choice([40, 350]))]))
+    expected = grown(without_crumbs(join(pieces, weight, box, shown)), 500)
     given = [{"view": int(p.photo), "rows": p.rows.tolist(), "resolution": p.resolution, "cut": p.cut}
              for p in pieces]  # fmt: skip
     body = """const edges = [[1, 0, 0], [0, 1, 0], [0, 0, 1]];
       const box = ({ rows }) => m.uprightBox(rows, given.points, given.weight, edges);
-      const shown = given.shown.map((rows) => Uint8Array.from(given.weight, (_, i) => rows.includes(i)));
-      return m.grown(m.withoutCrumbs(m.join(given.pieces, given.weight, box, shown)), 400).map(
+      const shows = (view, i) => given.shown[view].includes(i);
+      return m.grown(m.withoutCrumbs(m.join(given.pieces, given.weight, box, shows)), 500).map(
       ({ rows, votes }) => [rows.toSorted((a, b) => a - b), new Set(votes.map(({ view }) => view)).size]);"""
     told = {"pieces": given, "weight": weight.tolist(), "points": points.ravel().tolist()}
-    found = module(page, "things", body, told | {"shown": [rows.tolist() for rows in shown]})
+    found = module(page, "things", body, told | {"shown": [rows.tolist() for rows in shown.values()]})
     assert len(found) > 5
     assert sorted(found) == sorted([sorted(one.rows.tolist()), one.views] for one in expected)
 

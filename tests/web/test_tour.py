@@ -177,6 +177,8 @@ def test_a_video_says_what_it_lacks(tmp_path, monkeypatch):
     shots = tour_shots(scene, TOUR.replace("ask%3D", "x%3D"), (96, 64))
     with pytest.raises(UserError, match="choose another name"):
         write_video(tmp_path / "a.nothing", scene, shots[-1:])
+    with pytest.raises(UserError, match="no stop of the tour has a word"):
+        write_video(tmp_path / "a.mp4", scene, shots[-1:], things=True)
     assert not list(tmp_path.iterdir())
     for bad in ("#stop=view%3D1", "#stop=view%3Da%2Cb", "#stop=", "#stop=view%3D1%2C2%2C3%2C4%2C5%2C6%2C700"):
         with pytest.raises(UserError, match="tour"):
