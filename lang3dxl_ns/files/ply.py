@@ -115,7 +115,9 @@ def encode_ply(splats: Splats, relevancy: Float[Tensor, " n"] | None = None, com
     header += [f"comment {comment}"] if comment else []
     header += [f"element vertex {count}", *(f"property float {name}" for name in names), "end_header", ""]
     table = np.concatenate([array_of(block) for block in blocks.values()], axis=1)
-    return "\n".join(header).encode() + np.ascontiguousarray(table, dtype="<f4").tobytes()
+    # Other readers, such as plyfile and gsply, take a header in ASCII alone.
+    text = "\n".join(header).replace("±", "+-").encode("ascii", "replace")
+    return text + np.ascontiguousarray(table, dtype="<f4").tobytes()
 
 
 def _numbered(name: str, count: int) -> tuple[str, ...]:

@@ -35,6 +35,7 @@ KINDS = (
 )
 _IN_FOLDERS = ("*.ckpt", "nerfstudio_models/*.ckpt", "ckpts/*.pt", "point_cloud/iteration_*/point_cloud.ply")
 """Patterns of the files in which programs leave splats in a run's folder."""
+_RANK = re.compile(r"(ckpt_\d+_rank)\d+\.pt")
 _MOST_DAMAGE = 0.5
 """Share of Gaussians with NaN or infinite values above which a file is refused."""
 
@@ -66,8 +67,11 @@ def read_splats(path: str | Path) -> Splats:
         raise UserError(f"{path.name} {told}")
     try:
         # gsplat on several GPUs leaves a file of each (ckpt_6999_rank1.pt).
-        ranks = re.fullmatch(r"(ckpt_\d+_rank)\d+\.pt", path.name)
-        files = sorted(path.parent.glob(f"{ranks[1]}*.pt")) if ranks else [path]
+        ranks = _RANK.fullmatch(path.name)
+        near = path.parent.glob(f"{ranks[1]}*.pt") if ranks else [path]
+        files = sorted(file for file in near if not ranks or _RANK.fullmatch(file.name))  # no copies of them
+        if len(files) > 1:
+            say(f"{path}: its splat lies in {len(files)} files, a GPU's each, which are joined")
         splats = _joined([reader(file) for file in files])
     except ImportError as error:
         raise UserError(f"{path.suffix} files need gsply: pip install -e '.[share]'") from error

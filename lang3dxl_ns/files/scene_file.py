@@ -31,7 +31,7 @@ from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.device import known_device
 from lang3dxl_ns.common.errors import DAMAGE, UserError, in_a_line, not_of_memory
 from lang3dxl_ns.common.files import expanded, file_locked, set_aside, slugs, write_atomically
-from lang3dxl_ns.components.appearance import AppearanceConfig, AppearanceField
+from lang3dxl_ns.components.appearance import HIDDEN, AppearanceConfig, AppearanceField
 from lang3dxl_ns.components.decoders import DecoderConfig, make_decoder
 from lang3dxl_ns.components.feature_decoder import Decoder
 from lang3dxl_ns.components.field_settings import SemanticFieldConfig
@@ -83,8 +83,10 @@ class Provenance:
 
 
 def check_scene_name(path: Path) -> None:
-    """Raise UserError if the name ends in none of .scene, .glb and .spz."""
-    if path.suffix != SUFFIX and path.suffix not in _CARRIERS:
+    """Raise UserError if the path is a folder, or its name ends in none of .scene, .glb and .spz."""
+    if path.is_dir():
+        raise UserError(f"{path} is a folder: name a {SUFFIX} file in it")
+    if path.suffix != SUFFIX and path.suffix.lower() not in _CARRIERS:
         raise UserError(f"{path.name} must have the extension {SUFFIX}, {' or '.join(_CARRIERS)}")
 
 
@@ -116,8 +118,8 @@ def write_scene(path: Path, scene: Scene, provenance: Provenance | None = None) 
     photos = [replace(photo, mask=None) for photo in scene.photos]
     described["scene"] = asdict(replace(scene.file, photos=photos, data=Path(scene.file.data).name))
     data = save(content, {_KEY: json.dumps(described, separators=(",", ":"))})
-    if path.suffix in _CARRIERS:
-        data = _carried(path.suffix, scene, data)
+    if (kind := path.suffix.lower()) in _CARRIERS:
+        data = _carried(kind, scene, data)
     write_atomically(path, data)
     return len(data)
 
@@ -177,7 +179,7 @@ def keep_words(path: Path, words: Mapping[str, TaughtWord | None], tour: str | N
     `read_scene`."""
     from safetensors.numpy import save
 
-    if path.suffix in _CARRIERS:
+    if path.suffix.lower() in _CARRIERS:
         raise UserError(
             f"{path} can't be changed: write a scene, lang3dxl export {path} --scene-file NAME{SUFFIX}"
         )
@@ -282,7 +284,8 @@ def read_scene(
             looks = _looks(file, described)
         if (words := file.about.get("words")) is not None:
             expect(all(isinstance(word, str) for word in words), "its words are no texts")
-            rows = file.tensor("words", len(words), file.shapes["words"][1]).float()
+            width = file.shapes["words"][1] if decoder is None else decoder.clip_dim
+            rows = file.tensor("words", len(words), width).float()
             expect(bool(rows.isfinite().all()), "its words are not made of numbers")
             vectors = dict(zip(words, F.normalize(rows, dim=1), strict=True))
         masks = [file.mask(i) for i in range(len(file.scene.photos))]
@@ -378,8 +381,8 @@ def _opened(path: Path) -> Iterator[_File]:
     try:
         with ExitStack() as stack:
             place = path
-            if path.suffix in _CARRIERS:
-                if (record := _CARRIERS[path.suffix](path)) is None:
+            if (carried := _CARRIERS.get(path.suffix.lower())) is not None:
+                if (record := carried(path)) is None:
                     raise UserError("it holds splats without words")
                 place = Path(stack.enter_context(TemporaryDirectory())) / "record"
                 place.write_bytes(record)
@@ -436,7 +439,8 @@ def _parameters(settings: Mapping[str, Any], channels: int) -> int:
     if not settings:
         return 1000 * channels + channels**2
     levels, depth, width = (settings[name] for name in ("levels", "hidden_layers", "hidden_width"))
-    expect(max(settings["log2_table_size"], levels, depth) <= 64, "its decoder has too many layers")
+    most = max(settings["log2_table_size"], settings["fourier_frequencies"], levels, depth)
+    expect(most <= 64, "its decoder has too many layers")
     inputs = levels * settings["features_per_level"]
     table = inputs * 2 ** int(settings["log2_table_size"])
     return table + width * (inputs + depth * width + 2 * channels + 100)
@@ -445,5 +449,7 @@ def _parameters(settings: Mapping[str, Any], channels: int) -> int:
 def _looks(file: _File, described: dict[str, Any]) -> AppearanceField:
     names, config = described["names"], AppearanceConfig(**described["config"])
     expect(isinstance(names, list) and all(isinstance(name, str) for name in names), "its looks' photos")
+    # Before anything of that size is built; without names, vectors of any width take no bytes.
+    expect(file.shapes["looks.from_photo.weight"] == [HIDDEN, config.vector_dim], "its looks")
     expect(file.shapes["looks.vectors"] == [len(names), config.vector_dim], "its looks")
     return file.loaded("looks", AppearanceField(config, names, torch.zeros(3), 1.0), {"_extra_state": names})

@@ -11,7 +11,7 @@ import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
 from io import BufferedIOBase, BytesIO
-from math import floor, log2
+from math import exp, floor, log2
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -21,6 +21,7 @@ from jaxtyping import Float32, UInt8
 from numpy import ndarray as Array
 
 from lang3dxl_ns.common.checks import expect
+from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.files.activations import ALL_BANDS, array_of, check_memory, log_scales, tensor_of
 from lang3dxl_ns.rendering import Splats
@@ -172,15 +173,29 @@ def _quats_of_three(turns: UInt8[Array, "n 4"]) -> Float32[Array, "n 4"]:
     return np.roll(parts, 1, axis=1)
 
 
-def encode_spz(splats: Splats, record: bytes | None = None) -> bytes:
-    """Encode version 3. record: content of the scene's file. Raises UserError for coordinates too large for
-    24 bits."""
+def fractional_bits(splats: Splats) -> int:
+    """Return how many bits after the point coordinates have. Raises UserError for those too large for 24 bits
+    in all."""
     farthest = float(splats.means.abs().max()) if len(splats) else 0.0
     bits = min(floor(22 - log2(max(farthest, 1e-3))), 20)
     if bits < 0:
         raise UserError(
             f".spz holds coordinates up to 4 million, and these reach {farthest:,.0f}: write a .ply"
         )
+    return bits
+
+
+def encode_spz(splats: Splats, record: bytes | None = None) -> bytes:
+    """Encode version 3. record: content of the scene's file. Says what is rounded or cut so much that it
+    shows. Raises UserError as `fractional_bits`."""
+    bits, largest, sizes = fractional_bits(splats), exp(255 / 16 - 10), splats.scales.amax(1)
+    if len(splats) and 4 * 2.0**-bits > (usual := float(sizes.median())):
+        say(
+            f".spz rounds places to {2.0**-bits:.2g} units because one Gaussian is far away, and half of all "
+            f"are smaller than {usual:.2g}: leave far ones out (export --hide-floaters), or write a .ply"
+        )
+    if large := int((sizes > largest).sum()):
+        say(f".spz holds sizes up to {largest:.0f} units: {large:,} larger Gaussians are cut to that")
     flags = _ANTIALIASED * splats.antialiased + _RECORDS * (record is not None)
     head = _HEADER.pack(_MAGIC, 3, len(splats), splats.degree, bits, flags, 0)
     last = b"" if record is None else _RECORD.pack(_SCENE, len(record)) + record

@@ -125,10 +125,11 @@ class ScenePhoto:
 
     def foreground(self, size: tuple[int, int] | None = None) -> Bool[Tensor, "h w"] | None:
         """Read the photo's undistorted foreground at a size (height and width in pixels; default: the stored
-        mask's); None if it has no mask, or the mask is gone."""
+        mask's); None if it has no mask, or the mask is gone. Raises UserError for a damaged one."""
         mask = None if isinstance(self.mask, bytes) else self.photo().read_mask()
         if isinstance(self.mask, bytes):
-            mask = torch.from_numpy(np.array(Image.open(io.BytesIO(self.mask)).convert("1")))
+            with readable(f"the foreground of {self.name} can't be read", "write the scene file again"):
+                mask = torch.from_numpy(np.array(Image.open(io.BytesIO(self.mask)).convert("1")))
         return mask if mask is None or size is None else resize_nearest(mask, size)
 
 

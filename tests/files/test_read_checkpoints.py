@@ -65,12 +65,14 @@ def test_checkpoints_in_the_old_format_and_of_other_shapes_are_told(tmp_path):
         read_splats(tmp_path / "flat.pt")
 
 
-def test_a_checkpoint_of_several_gpus_is_read_whole(tmp_path):
+def test_a_checkpoint_of_several_gpus_is_read_whole_without_copies_of_its_files(tmp_path, capsys):
     splats = some_splats()
     for rank, part in enumerate((splats.select(torch.arange(100)), splats.select(torch.arange(100, 300)))):
-        torch.save(gsplat_state(part), tmp_path / f"ckpt_6999_rank{rank}.pt")
+        for copy in ("", " (copy)", "_copy"):
+            torch.save(gsplat_state(part), tmp_path / f"ckpt_6999_rank{rank}{copy}.pt")
     for file in ("ckpt_6999_rank0.pt", "ckpt_6999_rank1.pt"):
         assert_alike(read_splats(tmp_path / file), splats)
+        assert "lies in 2 files" in capsys.readouterr().out
 
 
 def test_older_names_in_checkpoints_are_read(tmp_path):

@@ -372,6 +372,24 @@ def test_an_spz_of_map_coordinates_is_refused_rather_than_cut(tmp_path):
         write_splats(tmp_path / "far.spz", far)
 
 
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({}, ""),
+        ({"means": 1e3}, ""),
+        ({"means": 2e6}, "rounds places to 0.5 units"),
+        ({"scales": 1e3}, "1 larger Gaussians are cut"),
+    ],
+)
+def test_what_one_gaussian_costs_the_others_of_an_spz_is_told(change, said, tmp_path, capsys):
+    splats = some_splats(50)
+    for name, value in change.items():
+        getattr(splats, name)[7, 0] = value
+    write_splats(tmp_path / "a.spz", splats)
+    told = capsys.readouterr().out
+    assert said in told and bool(said) == bool(told)
+
+
 # ── what other programs write ───────────────────────────────────────────────────────────────────────────
 
 

@@ -3,6 +3,7 @@
 import io
 import json
 import struct
+import zlib
 from dataclasses import replace
 
 import numpy as np
@@ -179,6 +180,7 @@ def set_at(told, value, *keys):
         (("decoder", "settings", "log2_table_size"), 62),
         (("decoder", "settings", "hidden_width"), 99_999),
         (("decoder", "settings", "levels"), [1, 2]),
+        (("decoder", "settings", "fourier_frequencies"), 99_999),
         (("decoder", "settings", "evil"), 1),
         (("looks", "names"), ["a"]),
         (("looks", "names"), "abc"),
@@ -245,17 +247,44 @@ def test_a_scene_without_numbers_is_refused_rather_than_answered_with_0(written,
         read_scene(path, "cpu")
 
 
-def test_codes_of_another_width_and_a_scene_of_nothing_are_refused(written):
+def test_codes_and_words_of_another_width_and_a_scene_of_nothing_are_refused(written):
     _, path = written
     whole = path.read_bytes()
     altered(path, lambda t: t | {"codes": np.concatenate([t["codes"], t["codes"][:, :1]], axis=1)})
     with pytest.raises(UserError, match=r"codes has the shape"):
         read_scene(path, "cpu")
     path.write_bytes(whole)
+    altered(path, lambda t: t | {"words": t["words"][:, :8].copy()})
+    with pytest.raises(UserError, match=r"words has the shape"):
+        read_scene(path, "cpu")
+    path.write_bytes(whole)
     each = ("means", "quats", "log_scales", "logits", "harmonics", "codes")
     altered(path, lambda t: {name: value[:0] if name in each else value for name, value in t.items()})
     with pytest.raises(UserError, match=r"it holds no Gaussian"):
         read_scene(path, "cpu")
+
+
+def test_numbers_that_no_bytes_stand_for_allocate_nothing(written):
+    _, path = written
+    wide = np.zeros((0, 10**12), np.float32)
+    altered(path, lambda t: t | {"looks.vectors": wide, "looks.from_photo.weight": wide})
+    rewritten(path, lambda told, _: told["looks"].update(names=[]))
+    rewritten(path, lambda told, _: set_at(told, 10**12, "looks", "config", "vector_dim"))
+    with pytest.raises(UserError, match=r"wall\.scene is not a readable scene \(its looks\)"):
+        read_scene(path, "cpu")
+
+
+def test_a_mask_whose_pixels_are_no_picture_is_told_where_it_is_needed(written):
+    _, path = written
+    parts = [(b"IHDR", struct.pack(">IIBBBBB", 96, 96, 8, 0, 0, 0, 0)), (b"IDAT", b"no zlib"), (b"IEND", b"")]
+    chunks = (
+        struct.pack(">I", len(d)) + k + d + struct.pack(">I", zlib.crc32(k + d)) for k, d in parts
+    )  # with sound checksums
+    mask = np.frombuffer(b"\x89PNG\r\n\x1a\n" + b"".join(chunks), np.uint8)
+    altered(path, lambda tensors: tensors | {"mask.0": mask})
+    scene = read_scene(path, "cpu", encode_texts=encode_texts)
+    with pytest.raises(UserError, match=rf"the foreground of {scene.photos[0].name} can't be read"):
+        scene.query("dome", scene.photos[0].name)
 
 
 @pytest.mark.parametrize("size", [30_000, 24])
@@ -293,3 +322,6 @@ def test_other_names_are_refused(tmp_path):
         read_scene(tmp_path / "a.ply")
     with pytest.raises(UserError, match="not a file"):
         read_scene(tmp_path / "none.scene")
+    (tmp_path / "folder.scene").mkdir()
+    with pytest.raises(UserError, match=r"folder\.scene is a folder"):
+        write_scene(tmp_path / "folder.scene", painted_scene())
