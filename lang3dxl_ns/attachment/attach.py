@@ -21,6 +21,7 @@ from lang3dxl_ns.common.files import expanded, make_folder
 from lang3dxl_ns.common.stages import Stages
 from lang3dxl_ns.files.read_splats import find_splats, read_splats
 from lang3dxl_ns.files.scene_file import Provenance, check_scene_name, replace_scene
+from lang3dxl_ns.files.spz import fractional_bits
 from lang3dxl_ns.preparation.model_files import check_encoders
 from lang3dxl_ns.preparation.segmentation import find_text_segmenter, load_text_segmenter
 from lang3dxl_ns.query.match import save_picture
@@ -70,7 +71,7 @@ def attach(
     stages = Stages(_SHARES | {"segment": 0.3} if config.segment else _SHARES)
     worker = known_device(device)
     with stages.stage("splat"):  # a damaged one is refused before any model is downloaded
-        splats = _read(path).to(worker)
+        splats = _read(path, place).to(worker)
     preparation = settled(config, learned=False, gathered=True)
     check_encoders(preparation.clip, preparation.dense)
     found = find_text_segmenter(preparation.foreground_model, preparation.sam) if config.segment else None
@@ -80,7 +81,7 @@ def attach(
             folder = place.with_name(f".{place.stem}.views")
             collection, similarity = rendered_views(splats, config.views, config.up, folder), np.eye(4)
         else:
-            collection = open_capture(data)
+            collection = open_capture(data, cache_dir=config.cache_dir)
             similarity = _frame(splats, collection, path, place)
     with stages.stage("prepare"):
         cache = cache_folder(collection.folder, config.cache_dir)
@@ -125,9 +126,12 @@ def _check_request(config: AttachConfig, data: str | Path | None, place: Path | 
     check_data(None if data is None else Path(data))
 
 
-def _read(path: Path) -> Splats:
-    """Read and report a splat. Raises UserError if it is damaged, or too small or far away to be drawn."""
+def _read(path: Path, place: Path | None) -> Splats:
+    """Read and report a splat. Raises UserError if it is damaged, too small or far away to be drawn, or too
+    far for the file to write."""
     splats = read_splats(path)
+    if place is not None and place.suffix.lower() == ".spz":
+        fractional_bits(splats)
     middle = splats.means.median(0).values
     spread, far = float((splats.means - middle).norm(dim=1).median()), float(middle.norm())
     if spread < max(_SMALLEST, _NEAREST * far):
@@ -142,9 +146,10 @@ def _read(path: Path) -> Splats:
 
 def _frame(splats: Splats, collection: Capture, path: Path, place: Path | None) -> Similarity:
     """Find and report the similarity from the photos' frame to the splat's, or raise UserError."""
-    reasons = [*collection.left_out.values(), *collection.contradicted.values()]
+    reasons = collection.left_out | collection.contradicted
     if reasons:
-        say(f"{len(reasons)} photos are left out: {some(reasons, 3)}")
+        named = [f"{name}: {why}" for name, why in reasons.items()]
+        say(f"{len(named)} photos are left out: {some(named, 3)}")
     fit, shown = find_frame(splats, collection, path), ""
     if not fit.fits:
         if place is not None:

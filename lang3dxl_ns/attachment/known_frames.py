@@ -10,6 +10,7 @@ from numpy import ndarray as Array
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
+from lang3dxl_ns.common.checks import FARTHEST, expect
 from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import DAMAGE
 from lang3dxl_ns.common.files import read_json
@@ -50,6 +51,8 @@ def _of_run(splat: Path) -> dict[str, Similarity]:
         try:
             content = read_json(folder / RUN_TRANSFORM)
             rows = np.array(content["transform"], np.float64).reshape(3, 4) * float(content["scale"])
+            sound = np.abs(rows).max() < FARTHEST and np.linalg.det(rows[:, :3]) > 0  # not flat or mirrored
+            expect(bool(sound), "it is no frame")
         except DAMAGE:
             continue
         own = np.vstack([rows, [0, 0, 0, 1]])

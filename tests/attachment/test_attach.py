@@ -1,6 +1,7 @@
 """Words for a finished splat, with its photos and without; and back."""
 
 import os
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -122,6 +123,25 @@ def test_a_splat_in_map_coordinates_is_refused(tmp_path):
     write_splats(tmp_path / "far.ply", far)
     with pytest.raises(UserError, match=r"5,015,9.. units from the origin.* without the offset"):
         attach(tmp_path / "far.ply", None, tmp_path / "far.scene", SETTINGS)
+
+
+def test_a_splat_too_far_for_the_file_to_write_is_refused_before_any_work(tmp_path):
+    splats = box_splat(0.1)
+    splats.means[0] = 9e6
+    write_splats(tmp_path / "far.ply", splats)
+    with pytest.raises(UserError, match="these reach 9,000,000"):
+        attach(tmp_path / "far.ply", None, tmp_path / "far.spz", replace(SETTINGS, clip="absent/clip"))
+
+
+def test_photos_are_opened_with_the_reconstruction_that_the_cache_keeps(place, tmp_path, monkeypatch):
+    cache = tmp_path / "cache"
+    shutil.copytree(place / "photos" / "images", tmp_path / "photos")
+    shutil.copytree(place / "photos" / "sparse", cache / "reconstruction" / "sparse")
+    found = {}
+    monkeypatch.setattr("lang3dxl_ns.attachment.attach._frame", lambda _, photos, *__: found.update(a=photos))
+    with pytest.raises(TypeError):  # there is no frame
+        attach(place / "box.ply", tmp_path / "photos", None, replace(SETTINGS, cache_dir=cache))
+    assert len(found["a"].photos) == 5 and not (tmp_path / "photos" / "lang3dxl_cache").exists()
 
 
 def test_a_damaged_splat_is_told_before_encoders_are_looked_for(tmp_path):

@@ -121,6 +121,14 @@ def test_few_photos_must_agree_better_than_many():
     assert fit(0.55, 12).fits and not fit(0.55, 3).fits and fit(0.7, 3).fits and not fit(0.45, 12).fits
 
 
+@pytest.mark.parametrize("scale", [0.0, -1.0, np.nan, 1e308])
+def test_a_file_of_a_run_that_names_no_frame_leaves_the_others(collection, scale, tmp_path):
+    others = known_frames(collection.reconstruction, tmp_path / "a.ply")
+    content = {"transform": np.eye(4)[:3].tolist(), "scale": scale}
+    (tmp_path / RUN_TRANSFORM).write_text(json.dumps(content))
+    assert known_frames(collection.reconstruction, tmp_path / "a.ply").keys() == others.keys()
+
+
 @pytest.mark.parametrize("damaged", ["images", "masks"])
 def test_a_damaged_photo_or_mask_is_not_compared(tmp_path, damaged):
     write_scene(tmp_path, size=(120, 90), photos=8, points=400)
