@@ -109,6 +109,8 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 _TEXTS = "Texts follow --text: lang3dxl {} RUN --text windows{}"
+_PLACES = (".scene", ".glb", ".spz", ".yml", ".ply", ".sog", ".splat", ".pt", ".ckpt")
+"""Endings of what holds a scene or a splat."""
 _MORE = "Settings that few need are listed too with --help-all."
 
 
@@ -134,7 +136,7 @@ def _parsed(words: Sequence[str]) -> Any:
 
 def with_all_texts(words: Sequence[str]) -> list[str]:
     """Repeat --text before each further text, as people write `--text windows doors`. What names a file or
-    folder is the scene and stays as it is."""
+    folder is the scene and stays as it is. Raises UserError for what is written like one and is not there."""
     given, value, texts = [], False, False
     for word in words:
         if word.startswith("-"):
@@ -142,6 +144,8 @@ def with_all_texts(words: Sequence[str]) -> list[str]:
         elif value:
             value = False
         elif texts and not Path(word).exists():
+            if "/" in word or Path(word).suffix.lower() in _PLACES:
+                raise UserError(f"{word} does not exist: correct the name, or write --text before a text")
             given.append("--text")
         given.append(word)
     return given

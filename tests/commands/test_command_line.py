@@ -91,6 +91,13 @@ def test_several_texts_may_follow_their_flag_and_the_scene_too(tmp_path):
     assert cli.with_all_texts(["teach", scene, "--text=a", "b"]) == ["teach", scene, "--text=a", "b"]
 
 
+@pytest.mark.parametrize("word", ["castl.scene", "castl.GLB", "../runs/castle"])
+def test_a_mistyped_scene_is_no_text_of_the_newest_run(word):
+    assert cli.with_all_texts(["query", "--text", word, "St. Mary"])[-2:] == ["--text", "St. Mary"]
+    with pytest.raises(SystemExit, match=f"{word} does not exist: correct the name"):
+        cli.main(["query", "--text", "windows", word])
+
+
 @pytest.mark.parametrize("command", ["train", "reconstruct", "prepare", "needs"])
 @pytest.mark.parametrize("spelled", [["photos"], ["--data", "photos"], ["--data=photos"]])
 def test_a_folder_of_photos_is_taken_with_and_without_its_options_name(command, spelled):
