@@ -84,9 +84,8 @@ class EvaluateRun(_Scored):
         from lang3dxl_ns.files.runs import OUTPUTS, find_config
 
         place = self.run or OUTPUTS
-        if place.suffix == ".scene" or (
-            any(place.glob("[!.]*.scene")) and not (place / "config.yml").exists()
-        ):
+        file = place.suffix == ".scene" or (place.is_file() and place.suffix != ".yml")
+        if file or (any(place.glob("[!.]*.scene")) and not (place / "config.yml").exists()):
             return self._score_scene(place)
         from lang3dxl_ns.plugin.trainer_config import open_run
 
@@ -162,6 +161,8 @@ class EvaluatePool:
                     f"scenes of one name are told apart by lang3dxl evaluate run … --scene NAME"
                 )
             scenes[name] = results
+            if path.resolve() == (self.out / f"{REPORT}.json").resolve():
+                raise UserError(f"{path} would be written over: name another folder after --out")
         protocols = {name: results["protocol"] for name, results in scenes.items()}
         for key in ("layout", "scored_at"):
             if len({str(protocol.get(key)) for protocol in protocols.values()}) > 1:
@@ -188,6 +189,10 @@ class EvaluateSplit:
         names = held_out_photos(GroundTruth(self.ground_truth))
         if not names:
             raise UserError(f"no label in {self.ground_truth} marks a pixel; {_DRAWN}")
+        if cut := [name for name in names if " #" in f" {name}"]:
+            raise UserError(
+                f"in a list, # begins a comment: rename these labels and their photos: {some(cut)}"
+            )
         write_atomically(self.out, "\n".join(names) + "\n")
         print(f"Wrote {len(names)} names to {self.out}")
 

@@ -60,6 +60,7 @@ class Teach(OfScene):
         say(f"  most uncertain in {taught.unsure(self.word)}: check it, and mark it there next")
 
     def _example(self) -> Example:
+        from lang3dxl_ns.common.pictures import mask_values
         from lang3dxl_ns.evaluation.layouts import read_gray
         from lang3dxl_ns.words.taught_words import Example
 
@@ -68,8 +69,7 @@ class Teach(OfScene):
             tuple((x, y) for x, y in (_numbers(text, 2, f"{flag} X,Y") for text in texts))
             for texts, flag in ((self.at, "--at"), (self.not_at, "--not-at"))
         )
-        # A mask is true where the picture is at least half bright.
-        mask = None if self.mask is None else np.asarray(read_gray(self.mask, "mask")) >= 128
+        mask = None if self.mask is None else np.asarray(read_gray(self.mask, "mask", mask_values)) >= 128
         return Example(self.photo, mask, box, points, others)  # type: ignore[arg-type]
 
 

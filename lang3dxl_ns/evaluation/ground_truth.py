@@ -22,6 +22,7 @@ from lang3dxl_ns.evaluation.layouts import (
     read_lerf_ovs,
     read_plain,
 )
+from lang3dxl_ns.scene.names import normal_parts
 
 Layout = Literal["holyscenes", "lerf_ovs", "plain"]
 _READERS: dict[str, Callable[[Path], Mapping[str, Mapping[str, MaskFile | Outlines]]]] = {
@@ -49,6 +50,8 @@ class GroundTruth:
         self.layout: Layout = _layout(self.folder) if layout == "auto" else layout
         self._annotations = _READERS[self.layout](self.folder)
         self._labeled = {photo for photos in self._annotations.values() for photo in photos}
+        self._forms = {normal_parts(name): name for name in self._labeled}
+        self._forms |= {PurePosixPath(name).parts: name for name in self._labeled}
 
     @property
     def categories(self) -> list[str]:
@@ -65,10 +68,14 @@ class GroundTruth:
         return list(self._annotations[category])
 
     def key(self, photo: str) -> str | None:
-        """Find the labels' name for a photo (whose name may contain folders); None if it has no label."""
-        path = PurePosixPath(photo)
-        names = (path.as_posix(), path.with_suffix("").as_posix(), path.name, path.stem)
-        return next((name for name in names if name in self._labeled), None)
+        """Find the labels' name for a photo (whose name may contain folders, other capitals, or accents in
+        another form); None if it has no label."""
+        for *folders, last in filter(None, (PurePosixPath(photo).parts, normal_parts(photo))):
+            stem = PurePosixPath(last).stem
+            for form in ((*folders, last), (*folders, stem), (last,), (stem,)):
+                if form in self._forms:
+                    return self._forms[form]
+        return None
 
     def check(self, photos: Collection[str]) -> None:
         """Check that each label belongs to one photo of the scene; warn about labels without a photo."""

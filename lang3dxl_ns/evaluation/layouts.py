@@ -9,8 +9,9 @@ bottom], "segmentation": [[x, y], …]}, …]}`, in pixels. Several objects may 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -41,12 +42,13 @@ class Truth:
     """Left, top, right and bottom in pixels of the mask, edges included; None if the labels have no boxes."""
 
 
-def read_gray(path: Path, what: str = "ground truth", behind: int = 0) -> Image.Image:
-    """Read a picture as gray values 0…255, over the value `behind` where it is transparent. Raises UserError
-    if it cannot be read."""
+def read_gray(
+    path: Path, what: str = "ground truth", values: Callable[[Image.Image], Image.Image] = gray_values
+) -> Image.Image:
+    """Read a picture as gray values 0…255. Raises UserError if it cannot be read."""
     problem, damage = f"{what} {path} can't be read", (OSError, NoPictureError)
     with readable(problem, "replace or remove it", damage), open_picture(path) as image:
-        return gray_values(image, behind)
+        return values(image)
 
 
 def check_shape(path: Path, mine: tuple[int, int], other: tuple[int, int]) -> None:
@@ -83,7 +85,7 @@ class MaskFile:
         return Truth(gray < 128 if self.dark else gray >= 128)
 
     def _read(self) -> Image.Image:
-        image = read_gray(self.path, behind=255 if self.dark else 0)
+        image = read_gray(self.path, values=partial(gray_values, behind=255 if self.dark else 0))
         if not self.dark and image.getextrema()[1] == 1:
             raise UserError(f"ground truth {self.path} holds only 0 and 1, which look black: save 0 and 255")
         return image

@@ -39,8 +39,6 @@ class EvaluatedPhoto:
     appearance `fitted`, the rendering in the look of the half-image protocol."""
     maps: Maps
     """Relevancy by category, as queries show it, at the size of scoring; empty without ground truth."""
-    masked: bool = False
-    """Whether the maps are restricted to a foreground mask."""
 
     def write_pictures(self, folder: Path) -> None:
         """Write every picture to `folder` as a JPEG named after the photo."""

@@ -15,10 +15,11 @@ from torch import Tensor
 from lang3dxl_ns.common.console import tracked
 from lang3dxl_ns.common.errors import UserError, readable
 from lang3dxl_ns.common.files import expanded, read_array, slugs
+from lang3dxl_ns.common.pictures import PHOTO_SUFFIXES, mask_values
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth
 from lang3dxl_ns.evaluation.layouts import PICTURES, check_shape, read_gray
 from lang3dxl_ns.evaluation.scores import Maps, MapScorer, resize_map, strongest_level
-from lang3dxl_ns.scene.companions import companion
+from lang3dxl_ns.scene.masks import MaskFolder
 
 _LARGEST = 1e30
 """Largest score taken as finite. The squares of larger ones overflow float32."""
@@ -50,17 +51,20 @@ def score_predictions(
         raise UserError(f"{maps} is not a folder: pass the one that holds <prompt>/<photo>.npy")
     scorer, folders = MapScorer(truth), dict(zip(truth.categories, slugs(truth.categories), strict=True))
     keys = truth.labeled if photos is None else list(dict.fromkeys(_key(truth, photo) for photo in photos))
-    files = {} if masks is None else {key: _mask_file(masks, key) for key in keys}
+    files = {} if masks is None else _mask_files(expanded(masks), keys)
     figures: dict[str, dict[str, float]] = {}
     for key in tracked(keys, "scoring"):
         size = truth.scoring_size(*truth.size(key))
         truths = truth.truths(key, size)
         found: Maps = {c: _read_map(maps, (c, folders[c]), key, size) for c in truths}
-        keep = torch.from_numpy(np.asarray(read_gray(files[key], "mask")) >= 128) if files else None
+        keep = None
+        if files:
+            keep = torch.from_numpy(np.asarray(read_gray(files[key], "mask", mask_values)) >= 128)
+            check_shape(files[key], (keep.shape[0], keep.shape[1]), size)
         figures[key] = scorer.scores(key, scorer.variants(found, keep, temperature), truths)
     statement = f"predictions are 0 outside the masks of {len(files)} of {len(keys)} photos, {masks}"
     protocol = {"maps": str(maps), "evaluated_photos": len(keys)} | scorer.protocol(
-        statement if files else "none beyond those in the maps"
+        statement if files else "none beyond those in the maps", of="labels'"
     )
     return figures, protocol
 
@@ -105,8 +109,12 @@ def _key(truth: GroundTruth, photo: str) -> str:
     return key
 
 
-def _mask_file(folder: Path, photo: str) -> Path:
-    path = companion(folder, f"{photo}.png", (".png", ".jpg", ".jpeg", ".JPG", ".PNG"))
-    if path is None:
-        raise UserError(f"{folder} holds no mask of the photo {photo}: add it, white = keep")
-    return path
+def _mask_files(folder: Path, keys: Sequence[str]) -> dict[str, Path]:
+    """Find the masks of labels, whose names lack the photos' suffixes. Raises UserError for a missing one."""
+    masks, files = MaskFolder(folder), dict[str, Path]()
+    for key in keys:
+        found = filter(None, (masks.find(f"{key}{suffix}") for suffix in (*PHOTO_SUFFIXES, "")))
+        if (path := next(found, None)) is None:
+            raise UserError(f"{folder} holds no mask of the photo {key}: add it, white = keep")
+        files[key] = path
+    return files

@@ -120,7 +120,8 @@ class Evaluation:
         return results
 
     def _protocol(self, evaluated: list[EvaluatedPhoto]) -> dict[str, Any]:
-        scorer, masked = self.scorer, sum(photo.masked for photo in evaluated)
+        scorer = self.scorer
+        masked = sum(self.data.photos[photo.name].mask_path is not None for photo in evaluated)
         split, trained = self.settings.evaluated_photos, set(self.data.capture.split.train)
         photos: dict[str, Any] = {"split": split, "evaluated_photos": len(evaluated)}
         photos["seen_in_training"] = sum(photo.name in trained for photo in evaluated)
@@ -209,8 +210,7 @@ class _Photos:
         images = {"img": torch.cat([target, rendering.rgb], dim=1)}
         if rendering.channels is not None:
             images["bottleneck"] = rendering.channels
-        masked = self.data.photos[batch["name"]].mask_path is not None
-        evaluated = EvaluatedPhoto(batch["name"], metrics, images, {}, masked)
+        evaluated = EvaluatedPhoto(batch["name"], metrics, images, {})
         if self.scorer is not None:
             self._score_words(self.scorer, camera, evaluated, batch)
         return evaluated

@@ -10,11 +10,13 @@ from jaxtyping import Float
 from numpy import ndarray as Array
 from scipy.optimize import linear_sum_assignment
 
+from lang3dxl_ns.common.console import say, some
 from lang3dxl_ns.common.errors import UserError, readable
 from lang3dxl_ns.common.files import read_json
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth
 from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.query.text import Prompt
+from lang3dxl_ns.scene.names import resolve
 from lang3dxl_ns.things.write import coco
 
 
@@ -34,17 +36,23 @@ def score_things(scene: Scene, path: Path) -> list[tuple[str, int, int, int, flo
     else:
         with readable(f"{path} holds no COCO instances", "export the boxes from the labeling tool as COCO"):
             content = read_json(path)
-            true, words = _boxes(content), [str(category["name"]) for category in content["categories"]]
-            names = {image["file_name"] for image in content["images"]} & sizes.keys()
+            words = list(dict.fromkeys(str(category["name"]) for category in content["categories"]))
+            files = list(dict.fromkeys(str(image["file_name"]) for image in content["images"]))
+            found, _ = resolve(files, sizes.__contains__, lambda: sizes, "photos")
+            for image in content["images"]:
+                image["file_name"] = found.get(str(image["file_name"]))
+            true, names = _boxes(content), set(found.values())
+        if names and (absent := [file for file in files if file not in found]):
+            say(f"{len(absent)} photos of {path} fit none of this scene, or several: {some(absent)}")
     if not names or not words:
         raise UserError(f"{path} names no photo of this scene: file_name must be {scene.photos[0].name}, …")
     given, scores = _boxes(coco(scene, scene.things([Prompt(word) for word in words]))), []
     for word in words:
         sides = [[np.array(of.get((n, word), [])).reshape(-1, 4) for of in (true, given)] for n in names]
         there, listed = (sum(len(side[i]) for side in sides) for i in (0, 1))
-        found = sum(_matches(*side) for side in sides)
-        f1 = round(2 * found / (there + listed), 3) if there + listed else None
-        scores.append((word, there, found, listed - found, f1))
+        right = sum(_matches(*side) for side in sides)
+        f1 = round(2 * right / (there + listed), 3) if there + listed else None
+        scores.append((word, there, right, listed - right, f1))
     return scores
 
 

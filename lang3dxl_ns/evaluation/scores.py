@@ -236,10 +236,11 @@ class MapScorer:
             found |= score_maps(maps, truths, prefix, self.smooths)
         return found
 
-    def protocol(self, mask: str) -> dict[str, Any]:
-        """Describe for a report what the figures mean. `mask` says how the foreground was treated."""
+    def protocol(self, mask: str, of: str = "photo's") -> dict[str, Any]:
+        """Describe for a report what the figures mean. `mask` says how the foreground was treated, and `of`
+        whose size was halved for masks."""
         truth = self.truth
-        size = "the labels'" if self.smooths else "half the photo's"
+        size = "the labels'" if self.smooths else f"half the {of}"
         return {
             "ground_truth": str(truth.folder),
             "layout": truth.layout,

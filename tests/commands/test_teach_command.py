@@ -143,9 +143,10 @@ def test_words_are_not_saved_over_a_scene(place):
     assert words(place)
 
 
-def test_a_mask_teaches_and_queries_say_so(place, tmp_path, capsys):
+@pytest.mark.parametrize("white", [255, 1])
+def test_a_mask_teaches_and_queries_say_so(place, tmp_path, capsys, white):
     mask = np.zeros((96, 96), np.uint8)
-    mask[62:76, 62:76] = 255
+    mask[62:76, 62:76] = white
     Image.fromarray(mask).save(tmp_path / "m.png")
     teach(place, "--mask", str(tmp_path / "m.png"))
     out = tmp_path / "found"

@@ -1,6 +1,7 @@
 """Ground truth in three layouts: masks and boxes are those that were labeled, and errors name the file."""
 
 import json
+import unicodedata
 
 import numpy as np
 import pytest
@@ -38,6 +39,18 @@ def test_photos_are_found_with_and_without_their_folders(tmp_path):
     assert truth.key("right/0001.JPG") is None
     assert truth.key("somewhere/0002.v2.png") == "0002.v2"
     assert truth.masks("0003.jpg", (40, 60)) == {}
+
+
+def test_labels_in_another_form_of_letters_are_found_and_a_line_of_no_name_is_none(tmp_path):
+    """As archives and disks of other systems write them."""
+    for name in (unicodedata.normalize("NFD", "façade"), "0002", "IMG_3"):
+        write_plain(tmp_path, "dome", name, MASK)
+    truth = GroundTruth(tmp_path)
+    assert truth.key(unicodedata.normalize("NFC", "façade.png")) == unicodedata.normalize("NFD", "façade")
+    assert truth.key("a\\0002.JPG") == "0002" and truth.key("img_3.jpg") == "IMG_3"
+    assert [truth.key(name) for name in (".", "..", "/", "")] == [None] * 4
+    write_plain(tmp_path, "dome", "img_3", ~MASK)
+    assert [GroundTruth(tmp_path).key(name) for name in ("img_3.jpg", "IMG_3.jpg")] == ["img_3", "IMG_3"]
 
 
 def test_a_label_whose_name_has_a_dot_is_its_own(tmp_path):

@@ -113,6 +113,23 @@ def test_masks_cut_predictions_and_are_stated(scene, tmp_path, mask):
         score_predictions(GroundTruth(truth), maps, masks=folder)
 
 
+@pytest.mark.parametrize("name", ["0002.png", "0002.JPG.png", "0002_mask.tif"])
+@pytest.mark.parametrize("values", ["255", "1", "palette"])
+def test_masks_are_read_as_training_reads_them(scene, tmp_path, mask, name, values):
+    truth, maps = scene
+    (tmp_path / "masks").mkdir()
+    image = Image.fromarray(mask.astype(np.uint8) * np.uint8(255 if values == "255" else 1))
+    if values == "palette":
+        image = Image.fromarray(mask.astype(np.uint8), "P")
+        image.putpalette([0, 0, 0, 90, 0, 0])
+    image.save(tmp_path / "masks" / name)
+    photos, _ = score_predictions(GroundTruth(truth), maps, ["0002"], tmp_path / "masks")
+    assert photos["0002"]["raw_ap_rose window"] == 1
+    image.transpose(Image.Transpose.ROTATE_90).save(tmp_path / "masks" / name)
+    with pytest.raises(UserError, match=rf"{name} has 40 × 60 pixels.*another aspect ratio"):
+        score_predictions(GroundTruth(truth), maps, ["0002"], tmp_path / "masks")
+
+
 def test_only_the_photos_that_are_asked_for_are_scored(scene):
     truth, maps = scene
     (maps / "rose window" / "0002.npy").unlink()
@@ -185,6 +202,10 @@ def test_the_command_reports_and_reports_are_put_together(scene, tmp_path, mask,
     assert pooled["image_pooled"]["map"] == pytest.approx((2 * by_scene[0] + by_scene[1]) / 3)
     assert set(pooled["protocols"]) == {"milano", "st_paul"}
 
+    for out in (one, tmp_path / "two" / ".." / "two"):
+        with pytest.raises(SystemExit, match=r"scores\.json would be written over"):
+            cli.main(["evaluate", "pool", "--reports", *reports, "--out", str(out)])
+    assert json.loads((one / "scores.json").read_text()) == report
     with pytest.raises(SystemExit, match="second report of the scene milano"):
         cli.main(["evaluate", "pool", "--reports", reports[0], reports[0], "--out", str(both)])
     (tmp_path / "other.json").write_text('{"results": {}}')
@@ -205,6 +226,18 @@ def test_the_list_of_photos_to_hold_out_is_a_list_of_photos_to_score(scene, tmp_
     names.write_text("# nothing\n\n")
     with pytest.raises(SystemExit, match="is empty"):
         cli.main(["evaluate", "maps", *common, "--out", str(tmp_path / "out")])
+
+
+@pytest.mark.parametrize("name", ["castle #1", "#1"])
+def test_a_list_that_would_be_read_otherwise_is_not_written(tmp_path, mask, name):
+    for photo in ("castle", name, "a#b"):
+        write_plain(tmp_path / "truth", "rose window", photo, mask)
+    arguments = ["evaluate", "split", "--ground-truth", str(tmp_path / "truth"), "--out", str(tmp_path / "a")]
+    with pytest.raises(SystemExit, match=rf"rename .*: {name}$"):
+        cli.main(arguments)
+    (tmp_path / "truth" / "rose window" / f"{name}.png").unlink()
+    cli.main(arguments)
+    assert (tmp_path / "a").read_text() == "a#b\ncastle\n"
 
 
 def test_labels_that_mark_nothing_are_told(scene, tmp_path, mask):
@@ -232,4 +265,4 @@ def test_holyscenes_masks_are_scored_at_half_their_size(tmp_path, mask):
     write_map(tmp_path / "maps", "domes", "0001", mask[::2, ::2].astype(np.float32))
     photos, protocol = score_predictions(GroundTruth(tmp_path / "truth"), tmp_path / "maps")
     assert photos["0001"]["raw_iou_domes"] == 1
-    assert protocol["scored_at"] == "half the photo's size"
+    assert protocol["scored_at"] == "half the labels' size"

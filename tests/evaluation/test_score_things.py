@@ -1,6 +1,7 @@
 """Scores of things against COCO instances."""
 
 import json
+import os
 
 import pytest
 from painted_scene import painted_scene
@@ -31,6 +32,22 @@ def test_own_boxes_score_full_marks_in_any_size_and_each_is_found_once(tmp_path)
     file.write_text(json.dumps(content))
     ((_, _, found, false, _),) = score_things(scene, file)
     assert found < count and false == count - found
+
+
+def test_photos_and_words_count_once_however_they_are_written(tmp_path, capsys):
+    scene, file = painted_scene(), tmp_path / "labels.json"
+    content = coco(scene, scene.things("windows"))
+    file.write_text(json.dumps(content))
+    wanted = score_things(scene, file)
+    changes = str, str.upper, lambda name: f"D:\\{name}", os.path.basename
+    for image, change in zip(content["images"], changes, strict=True):
+        image["file_name"] = change(image["file_name"])
+    content["categories"].append({"id": 9, "name": "windows"})
+    content["annotations"][0]["category_id"] = 9
+    content["images"].append(content["images"][0] | {"id": 99, "file_name": "elsewhere.jpg"})
+    file.write_text(json.dumps(content))
+    assert score_things(scene, file) == wanted
+    assert "1 photos of" in (told := capsys.readouterr().out) and "elsewhere.jpg" in told
 
 
 def test_a_category_is_one_word_and_has_no_score_without_any_box(tmp_path):

@@ -1,17 +1,20 @@
 """Scores of masks, selected Gaussians and boxes, on a scene with known answers."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from painted_scene import DOME, WINDOWS, painted_file, painted_scene, painted_splats, photo
+from painted_scene import DOME, WINDOWS, decoded, painted_file, painted_scene, painted_splats, photo
 from PIL import Image
 
+from lang3dxl_ns import cli
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth
 from lang3dxl_ns.evaluation.score_scene import box_iou, score_scene, score_selections
+from lang3dxl_ns.files.scene_file import write_scene
 from lang3dxl_ns.query.view_ranking import Box
 from lang3dxl_ns.scene.camera import Lens
 from lang3dxl_ns.scene.photo import Photo
@@ -76,6 +79,24 @@ def test_scored_photos_whose_marks_taught_a_word_are_told(tmp_path):
     _, protocol = score_scene(scene.teach("dome", mark), truth)
     assert protocol["photos_that_taught"] == ["all/0003.jpg"]
     assert score_scene(scene, truth)[1]["photos_that_taught"] == []
+
+
+def test_a_splat_that_carries_a_scene_is_scored_as_its_scene_file(tmp_path):
+    scene, totals = painted_scene(**decoded("gathered")), []
+    label(scene, tmp_path / "truth")
+    for ending in ("scene", "GLB"):
+        write_scene(tmp_path / f"a.{ending}", scene)
+        words = [
+            "--ground-truth",
+            str(tmp_path / "truth"),
+            "--split",
+            "seen",
+            "--out",
+            str(tmp_path / ending),
+        ]
+        cli.main(["evaluate", "run", str(tmp_path / f"a.{ending}"), *words])
+        totals.append(json.loads((tmp_path / ending / "scores.json").read_text())["results"]["map"])
+    assert totals[0] == totals[1]
 
 
 def test_labels_elsewhere_get_none(tmp_path):

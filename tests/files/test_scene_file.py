@@ -180,7 +180,6 @@ def set_at(told, value, *keys):
         (("decoder", "settings", "log2_table_size"), 62),
         (("decoder", "settings", "hidden_width"), 99_999),
         (("decoder", "settings", "levels"), [1, 2]),
-        (("decoder", "settings", "fourier_frequencies"), 99_999),
         (("decoder", "settings", "evil"), 1),
         (("looks", "names"), ["a"]),
         (("looks", "names"), "abc"),
@@ -266,11 +265,15 @@ def test_codes_and_words_of_another_width_and_a_scene_of_nothing_are_refused(wri
 
 def test_numbers_that_no_bytes_stand_for_allocate_nothing(written):
     _, path = written
-    wide = np.zeros((0, 10**12), np.float32)
+    whole, wide = path.read_bytes(), np.zeros((0, 10**12), np.float32)
     altered(path, lambda t: t | {"looks.vectors": wide, "looks.from_photo.weight": wide})
     rewritten(path, lambda told, _: told["looks"].update(names=[]))
     rewritten(path, lambda told, _: set_at(told, 10**12, "looks", "config", "vector_dim"))
     with pytest.raises(UserError, match=r"wall\.scene is not a readable scene \(its looks\)"):
+        read_scene(path, "cpu")
+    path.write_bytes(whole)
+    rewritten(path, lambda told, _: set_at(told, 99_999, "decoder", "settings", "fourier_frequencies"))
+    with pytest.raises(UserError, match=r"its decoder has too many layers"):
         read_scene(path, "cpu")
 
 
