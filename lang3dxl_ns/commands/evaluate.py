@@ -85,6 +85,8 @@ class EvaluateRun(_Scored):
     def main(self) -> None:
         from lang3dxl_ns.files.runs import find_config, find_run
 
+        if self.ground_truth is not None:
+            GroundTruth(self.ground_truth, self.layout)  # fail now rather than after loading
         place = find_run(self.run)
         if place.suffix != ".yml" and not (place / "config.yml").is_file():
             return self._score_scene(place)
@@ -92,8 +94,6 @@ class EvaluateRun(_Scored):
             raise UserError("--clip is for scene files: leave it off, or name the .scene file of the run")
         from lang3dxl_ns.plugin.trainer_config import open_run
 
-        if self.ground_truth is not None:
-            GroundTruth(self.ground_truth, self.layout)  # fail now rather than after loading
         _, pipeline, _ = open_run(place)
         pipeline.config.evaluated_photos = self.split
         if self.ground_truth is not None:
