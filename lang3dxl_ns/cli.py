@@ -57,7 +57,7 @@ COMMANDS = {
     "teach": ("commands.teach:Teach", "Show a scene what a word means, by marking it in a photo."),
     "words": ("commands.teach:Words", "List, forget, save and load the words that a scene was taught."),
     "info": ("commands.view:Info", "Show a scene file's contents and origin."),
-    "view": ("commands.view:View", "Explore and query a trained scene in the viewer."),
+    "view": ("commands.view:View", "Explore and query a trained scene in a browser."),
     "demo-scene": ("lab.landmark.demo_scene:DemoScene", "Generate photos of a procedural landmark."),
     "evaluate": ("commands.evaluate:Evaluate", "Score words against ground truth."),
     "preset": ("commands.preset:Preset", "Print the flags that train a benchmark's scene as in the paper."),
@@ -111,7 +111,6 @@ def main(arguments: list[str] | None = None) -> None:
 _TEXTS = "Texts follow --text: lang3dxl {} RUN --text windows{}"
 _PLACES = (".scene", ".glb", ".spz", ".yml", ".ply", ".sog", ".splat", ".pt", ".ckpt")
 """Endings of what holds a scene or a splat."""
-_MORE = "Settings that few need are listed too with --help-all."
 
 
 def _parsed(words: Sequence[str]) -> Any:
@@ -124,8 +123,6 @@ def _parsed(words: Sequence[str]) -> Any:
             _choice(COMMANDS, words), prog="lang3dxl", args=words, description=__doc__, config=config
         )
     except SystemExit as error:
-        if not error.code and len(words) > 1 and "--help-all" not in sys.argv:
-            print(_MORE)
         if error.code == 2 and words[0] in ("query", "export"):
             print(_TEXTS.format(words[0], "" if words[0] == "query" else " --out found.ply"), file=sys.stderr)
         raise

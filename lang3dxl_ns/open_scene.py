@@ -11,7 +11,7 @@ from lang3dxl_ns.common.console import silence_libraries
 from lang3dxl_ns.common.device import known_device
 from lang3dxl_ns.common.errors import NO_NERFSTUDIO, UserError, misses_nerfstudio
 from lang3dxl_ns.common.files import expanded
-from lang3dxl_ns.files.runs import OUTPUTS, find_config
+from lang3dxl_ns.files.runs import find_run, scenes_in
 from lang3dxl_ns.files.scene_file import SUFFIX, Provenance, describe_scene_file, read_scene
 from lang3dxl_ns.query.question import QueryConfig
 from lang3dxl_ns.query.scene import Scene
@@ -28,10 +28,9 @@ def load_scene(
     """Open a scene for rendering and queries.
 
     Args:
-        path: a NAME.scene file, a folder that holds one, or a run of `ns-train lang3dxl`: its folder, or one
-            above it, whose newest run is opened. None opens the newest run under outputs/. Runs without a
-            scene file, and any config.yml, are converted, which needs nerfstudio. No code from the files is
-            executed.
+        path: a NAME.scene file, or the folder of a run or of a scene file, or one above it, whose newest run
+            is opened. None opens the newest run under outputs/. Runs without a scene file, and any
+            config.yml, are converted, which needs nerfstudio. No code from the files is executed.
         device: where the scene is held; by default a GPU if there is one.
         settings: default settings of queries.
         clip: name or folder of the scene's CLIP, if it is not where the scene file says.
@@ -58,12 +57,12 @@ def load_scene(
 def find_scene_file(path: str | Path | None = None) -> Path | None:
     """Find the scene file that a path names or holds. Returns None for a config.yml, and for a run without
     one. Raises UserError if there is neither a scene nor a run."""
-    place = OUTPUTS if path is None else expanded(path)
-    if place.suffix == SUFFIX or place.is_file():
+    if path is not None and expanded(path).suffix == SUFFIX:  # reading it says why it can't be opened
+        return expanded(path)
+    place = find_run(path)
+    if place.is_file():
         return None if place.suffix == ".yml" else place
-    # Some systems leave a hidden file beside each, such as ._castle.scene.
-    folder = place if any(place.glob(f"[!.]*{SUFFIX}")) else find_config(path).parent
-    scenes = sorted(folder.glob(f"[!.]*{SUFFIX}"))
+    scenes = scenes_in(place)
     if len(scenes) > 1:
         names = ", ".join(file.name for file in scenes[:5])
         raise UserError(f"{place} holds several scenes ({names}): name one of them")

@@ -6,6 +6,7 @@ import io
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 
 import torch
@@ -16,6 +17,7 @@ from lab.numerics.measure import Case, Row, measure
 from lab.reports import command_line
 from lang3dxl_ns.common.console import tracked
 from lang3dxl_ns.common.device import best_device
+from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import write_atomically
 from lang3dxl_ns.common.reports import describe_machine, markdown_table
 
@@ -40,6 +42,8 @@ class Numerics:
 
     def main(self) -> None:
         """Measure, write the report, and exit with an error if a case missed its bound."""
+        if find_spec("matplotlib") is None:
+            raise UserError("numerics.png needs matplotlib: pip install -e '.[lab]' in the checkout")
         device = best_device() if self.device == "auto" else self.device
         threads = torch.get_num_threads()
         torch.set_num_threads(1)  # the timer measures processor time

@@ -16,6 +16,7 @@ from typing import Literal
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.memory import machine_memory
+from lang3dxl_ns.common.settings_help import showing
 
 LEAST_MEMORY, LEAST_DISK = 4e9, 10e9
 """Least memory and disk space without a note, bytes. Encoders take 1 to 2 GB, and targets 8 MB per photo."""
@@ -38,6 +39,7 @@ class Finding:
         return "ok" if self.fine else self.bad
 
 
+@showing("build", "arch")
 @dataclass(kw_only=True)
 class Doctor:
     """Check versions, GPU, gsplat's build, disk and memory of this machine, and say what to do.
@@ -93,21 +95,23 @@ def findings() -> Iterator[Finding]:
 def versions() -> Iterator[Finding]:
     """Check Python and the required packages, pycolmap among them, against this package's requirements."""
     from packaging.requirements import Requirement
+    from packaging.specifiers import SpecifierSet
 
     fine, remedy = sys.version_info[:2] >= (3, 10), "make an environment of Python 3.10 or later"
     yield Finding("Python", sys.version.split()[0], fine, remedy, "problem")
     whole = find_spec("nerfstudio") is not None
     yield Finding("nerfstudio", *_nerfstudio_half(whole))
+    wanted = dict[str, SpecifierSet]()  # the base and the extra may both name a package
     for need in (Requirement(line) for line in requires("lang3dxl-ns") or []):
-        extra = "nerfstudio" if whole else ""
-        if need.marker is not None and not need.marker.evaluate({"extra": extra}):
-            continue
+        if need.marker is None or need.marker.evaluate({"extra": "nerfstudio" if whole else ""}):
+            wanted[need.name] = wanted.get(need.name, SpecifierSet()) & need.specifier
+    for name, specifier in wanted.items():
         found = ""
         with suppress(PackageNotFoundError):
-            found = version(need.name)
-        good = found != "" and need.specifier.contains(found.partition("+")[0], prereleases=True)
-        remedy = f"pip install '{need.name}{need.specifier}'"
-        yield Finding(need.name, found or "not installed", good, remedy, "problem")
+            found = version(name)
+        good = found != "" and specifier.contains(found.partition("+")[0], prereleases=True)
+        remedy = f"pip install '{name}{specifier}'"
+        yield Finding(name, found or "not installed", good, remedy, "problem")
 
 
 def _nerfstudio_half(installed: bool) -> tuple[str, bool, str]:

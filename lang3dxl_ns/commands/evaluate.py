@@ -73,32 +73,35 @@ class EvaluateRun(_Scored):
     scores.md and scores.json."""
 
     run: tyro.conf.Positional[Path | None] = None
-    """Folder of the run, or its config.yml (default: the newest under outputs/). For a .scene file, or a
-    folder that holds one, its words are scored with --ground-truth, without its run and photos."""
+    """Folder of the run, or its config.yml (default: the newest run under outputs/). Of a .scene file, and of
+    a run of lang3dxl train, words are scored with --ground-truth, without the photos."""
     split: Literal["held-out", "seen"] = "held-out"
     """Photos to score: those held out of training, or labeled training photos."""
     ground_truth: Path | None = None
     """Folder of ground truth (default: the run's setting, or the one beside its data)."""
+    clip: str | None = None
+    """Name or folder of the scene's CLIP, if it is not where the scene file says."""
 
     def main(self) -> None:
-        from lang3dxl_ns.files.runs import OUTPUTS, find_config
-
-        place = self.run or OUTPUTS
-        file = place.suffix == ".scene" or (place.is_file() and place.suffix != ".yml")
-        if file or (any(place.glob("[!.]*.scene")) and not (place / "config.yml").exists()):
-            return self._score_scene(place)
-        from lang3dxl_ns.plugin.trainer_config import open_run
+        from lang3dxl_ns.files.runs import find_config, find_run
 
         if self.ground_truth is not None:
             GroundTruth(self.ground_truth, self.layout)  # fail now rather than after loading
-        _, pipeline, _ = open_run(self.run)
+        place = find_run(self.run)
+        if place.suffix != ".yml" and not (place / "config.yml").is_file():
+            return self._score_scene(place)
+        if self.clip is not None:
+            raise UserError("--clip is for scene files: leave it off, or name the .scene file of the run")
+        from lang3dxl_ns.plugin.trainer_config import open_run
+
+        _, pipeline, _ = open_run(place)
         pipeline.config.evaluated_photos = self.split
         if self.ground_truth is not None:
             pipeline.config.ground_truth = self.ground_truth
         if self.ground_truth is not None or self.layout != "auto":
             pipeline.config.ground_truth_layout = self.layout
         results = pipeline.evaluation.scored(get_std=True)
-        if taught := _taught_beside(find_config(self.run).parent):
+        if taught := _taught_beside(find_config(place).parent):
             results["protocol"]["taught_words_left_out"] = taught
             words = ", ".join(taught)
             say(f"Scored by text alone: what examples taught ({words}) counts where the .scene file is named")
@@ -113,13 +116,14 @@ class EvaluateRun(_Scored):
         if self.ground_truth is None:
             raise UserError(f"{file} is scored with --ground-truth FOLDER, --split held-out or seen")
         truth = GroundTruth(self.ground_truth, self.layout)
-        scene = load_scene(file)
+        scene = load_scene(file, clip=self.clip)
         photos, protocol = score_scene(scene, truth, self.split)
         results = average(list(photos.values()), with_deviation=True)
         results |= score_selections(scene, truth, labeled_photos(scene, truth, self.split))
         write_scores(self.out, self.scene or file.stem, results | {"protocol": protocol, "photos": photos})
 
 
+@showing("scene", "coco", "out")
 @dataclass(kw_only=True)
 class EvaluateThings(OfScene):
     """Score single things against the boxes of labels, and write things.md and things.json."""
@@ -139,6 +143,7 @@ class EvaluateThings(OfScene):
         print(f"{table}\n\nWrote {self.out / 'things'}.md")
 
 
+@showing("reports", "out")
 @dataclass(kw_only=True)
 class EvaluatePool:
     """Combine scenes: average over all photos, and over the scenes' means. Writes scores.md and
@@ -175,10 +180,11 @@ class EvaluatePool:
         print(f"{table}\n\nWrote {self.out / REPORT}.md")
 
 
+@showing("ground_truth", "out")
 @dataclass(kw_only=True)
 class EvaluateSplit:
     """Choose labeled photos to hold out of training, up to five that show each category, always the same.
-    Pass the list to `ns-train lang3dxl … lang3dxl-colmap --held-out FILE`."""
+    Pass the list to `lang3dxl train FOLDER --held-out FILE`."""
 
     ground_truth: Path
     """Folder of the scene's ground truth."""
@@ -208,10 +214,11 @@ Evaluate = (
 
 def _taught_beside(run: Path) -> list[str]:
     """List the words that the scene files in a run's folder were taught."""
+    from lang3dxl_ns.files.runs import scenes_in
     from lang3dxl_ns.files.scene_file import describe_scene_file
 
     taught: list[str] = []
-    for file in sorted(run.glob("[!.]*.scene")):
+    for file in scenes_in(run):
         with suppress(UserError):  # a damaged one has no say in the run's figures
             taught += [word.name for word in describe_scene_file(file)["taught"]]
     return taught

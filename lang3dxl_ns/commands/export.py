@@ -101,8 +101,14 @@ class Export(OfScene):
             raise UserError("--not is a negative of texts: give --text too, or leave it off")
         if self.index is not None and (self.out is None or not self.text):
             raise UserError("--index lists the Gaussians that match: give --text and --out with it")
+        if self.all and self.text and self.index is None and self.out and self.out.suffix.lower() != ".ply":
+            raise UserError(
+                f"{self.out.name} can't hold relevancies: write a .ply, or leave --text or --all off"
+            )
         if self.settings != QueryConfig() and not self.text and self.web is None:
             raise UserError("settings of queries have no effect without --text: leave them off, or give one")
+        if self.settings.size is not None:
+            raise UserError("--size is that of pictures, of which export writes none: leave it off")
         return targets[0]
 
     def _splat(self, path: Path, scene: Scene, prompts: list[Prompt]) -> None:

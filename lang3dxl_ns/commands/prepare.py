@@ -54,12 +54,12 @@ class Reconstruct(ReconstructionSettings):
 class Prepare(PreparationConfig, CaptureSettings):
     """Make the targets that training learns from, in advance.
 
-    They are CLIP features of crops in physical scale, and dense features. Training makes missing targets
-    itself. This command can be interrupted and repeated at any time.
+    They are CLIP features of patches (of the built-in CLIP) or of crops, and dense features. Training makes
+    missing targets itself. This command can be interrupted and repeated at any time.
     """
 
     data: Path
-    """Folder of photos, with images/ and sparse/0/ or without a model, or a video."""
+    """Folder of photos, or a video."""
 
     def main(self) -> None:
         from lang3dxl_ns.preparation.model_files import check_encoders
@@ -84,7 +84,7 @@ class Needs(PreparationConfig, CaptureSettings):
     """
 
     data: Path
-    """Folder with images/ and sparse/0/."""
+    """Folder of photos, or a video."""
 
     def main(self) -> None:
         from lang3dxl_ns.preparation.needs import needs_table

@@ -10,14 +10,16 @@ import tyro
 
 from lang3dxl_ns.commands.train import Train
 from lang3dxl_ns.common.presets import OFFICIAL, scene_presets, train_flags
+from lang3dxl_ns.common.settings_help import showing
 
 
+@showing("name", "command")
 @dataclass
 class Preset:
     """Print flags that train a benchmark's scene as in the paper, for use as
 
-    ns-train lang3dxl-paper --data FOLDER $(lang3dxl preset holyscenes/milano)
-    lang3dxl train FOLDER $(lang3dxl preset holyscenes/milano --command train)
+    `ns-train lang3dxl-paper --data FOLDER $(lang3dxl preset holyscenes/milano)`
+    `lang3dxl train FOLDER $(lang3dxl preset holyscenes/milano --command train)`
 
     `official` prints flags for what the authors' release does differently. The flags of both can be combined.
     """

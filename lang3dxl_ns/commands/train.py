@@ -47,7 +47,8 @@ class Train(RunSettings, SceneSettings, PreparationConfig, CaptureSettings):
     """lang3dxl: words are learned after training. lang3dxl-paper: codes are trained with the scene, as
     printed."""
     steps: int | None = None
-    """Iterations (default: 30,000 on a GPU, 70,000 as printed, and 3,000 without one)."""
+    """Iterations (default: 30,000 on a GPU, 70,000 with --method lang3dxl-paper, and 3,000
+    without one)."""
     looks: Literal["auto", "on", "off"] = "auto"
     """Colors that depend on each photo's lighting. auto: where the photos differ in it."""
     photo_scale: float = 1.0

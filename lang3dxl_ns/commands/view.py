@@ -71,6 +71,7 @@ def _has_display() -> bool:
     return bool(desktop) and sys.stdout.isatty() and "SSH_CONNECTION" not in os.environ
 
 
+@showing("scene")
 @dataclass(kw_only=True)
 class Info:
     """Print what a scene file holds and where it comes from."""
@@ -81,10 +82,11 @@ class Info:
     def main(self) -> None:
         from lang3dxl_ns.files.scene_file import describe_scene_file
         from lang3dxl_ns.open_scene import existing_scene_file
+        from lang3dxl_ns.query.text import why_no_words
 
         told = describe_scene_file(existing_scene_file(self.scene))
         decoder, count = told["decoder"], told["gaussians"]
-        words = "none, only colors" if decoder is None else f"CLIP {told['clip']}, decoder {decoder['name']}"
+        words = f"CLIP {told['clip']}, decoder {decoder['name']}" if decoder else why_no_words(told["scene"])
         lines = {name.replace("_", " "): value for name, value in vars(told["provenance"]).items()} | {
             "Gaussians": f"{count:,}",
             "photos": f"{told['photos']}{', each with its lighting' if told['looks'] else ''}",

@@ -19,6 +19,12 @@ def model_option(name: str) -> str:
     return f"--pipeline.model.{name}" if _in_nerfstudio() else f"--{OWN_NAMES.get(name, name)}"
 
 
+def capture_option(name: str) -> str:
+    """Spell an option of how photos are found and split, such as `eval-mode`: nerfstudio's commands have it
+    at their end (see `data_option`)."""
+    return f"{'ns-train … lang3dxl-colmap ' if _in_nerfstudio() else ''}--{name}"
+
+
 def switched_on(option: str) -> str:
     """Spell an option, as `data_option` and `model_option` return it, that is switched on."""
     return f"{option} True" if _in_nerfstudio() else option

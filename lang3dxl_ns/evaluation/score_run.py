@@ -36,6 +36,7 @@ from lang3dxl_ns.evaluation.scores import LanguageScorer, bounds, inside, map_si
 from lang3dxl_ns.preparation.targets import Batch, foreground
 from lang3dxl_ns.query.answer import relevancy_maps
 from lang3dxl_ns.query.scene import Scene
+from lang3dxl_ns.query.text import NOT_FINISHED
 from lang3dxl_ns.rendering import composite
 from lang3dxl_ns.scene.camera import Camera
 from lang3dxl_ns.training.batches import TrainingData
@@ -44,7 +45,6 @@ from lang3dxl_ns.training.snapshot import snapshot
 from lang3dxl_ns.training.state import PhotoCamera, Training
 
 Split = Literal["held-out", "seen"]
-NOT_FINISHED = "this run has no semantics yet: they are learned when training ends; resume it"
 
 
 @dataclass

@@ -13,34 +13,45 @@ from lang3dxl_ns.common.files import expanded
 from lang3dxl_ns.scene.record import SCENE_FILE
 
 OUTPUTS = Path("outputs")
-"""Folder in which `ns-train` creates runs."""
-_REMEDY = "name a run's folder or config.yml, or train one with lang3dxl train FOLDER"
+"""Folder in which training creates runs."""
+_REMEDY = "name a scene file, a run's folder or its config.yml, or train one with lang3dxl train FOLDER"
 _DEEPEST = 4
-"""Deepest level of a run's folder below the given one; outputs/ holds SCENE/METHOD/TIME."""
+"""Deepest level of a run's folder below the given one; outputs/ holds NAME, or SCENE/METHOD/TIME."""
+_SCENES = "[!.]*.scene"
+
+
+def find_run(run: str | Path | None = None) -> Path:
+    """Find a run: the file that is named, or else a folder with a config.yml or a scene file. That is the
+    named one, or the newest run below it, which is said; None: the newest under outputs/. Runs of other
+    methods, which lack a scene description, are skipped. Raises UserError if there is no run."""
+    place = OUTPUTS if run is None else expanded(run)
+    if place.is_file() or _config(place).is_file() or scenes_in(place):
+        return place
+    if not place.is_dir():
+        what = "there is no outputs/ here" if run is None else f"{place} is not a file or folder"
+        raise UserError(f"{what}: {_REMEDY}")
+    below = ["*/" * n for n in range(1, _DEEPEST + 1)]
+    configs = [path.parent for level in below for path in place.glob(f"{level}config.yml") if path.is_file()]
+    ours = {folder for folder in configs if (folder / SCENE_FILE).is_file()}
+    ours |= {path.parent for level in below for path in place.glob(level + _SCENES) if path.is_file()}
+    if not ours:
+        others = f" of this method ({len(configs)} of others)" if configs else ""
+        raise UserError(f"{place} holds no run{others}: {_REMEDY}")
+    newest = max(ours, key=_began)
+    if len(ours) > 1:
+        say_once(f"Opening {newest}, the newest of {len(ours)} runs in {place}")
+    return newest
 
 
 def find_config(run: str | Path | None = None) -> Path:
-    """Find the config.yml of a run: the file itself, or that in the run's folder, or in a folder above it,
-    whose newest run is taken, which is said; None: the newest run under outputs/. Runs of other methods,
-    which lack a scene description, are skipped. Raises UserError if there is no run."""
-    place = OUTPUTS if run is None else expanded(run)
-    if place.is_dir():
-        if place.joinpath("config.yml").is_file():
-            return place / "config.yml"
-        found = (path for n in range(1, _DEEPEST + 1) for path in place.glob("*/" * n + "config.yml"))
-        configs = [path for path in found if path.is_file()]
-        ours = [path for path in configs if path.with_name(SCENE_FILE).is_file()]
-        if ours:
-            newest = max(ours, key=_began)
-            if len(ours) > 1:
-                say_once(f"Opening {newest.parent}, the newest of {len(ours)} runs in {place}")
-            return newest
-        others = f" of this method ({len(configs)} of others)" if configs else ""
-        raise UserError(f"{place} holds no run{others}: {_REMEDY}")
-    if not place.is_file():
-        what = "there is no outputs/ here" if run is None else f"{place} is not a file or folder"
-        raise UserError(f"{what}: {_REMEDY}")
-    return place
+    """Find the config.yml of a run of ns-train; `run` and errors are those of `find_run`."""
+    found = find_run(run)
+    return found if found.is_file() else _config(found)
+
+
+def scenes_in(folder: Path) -> list[Path]:
+    """List the scene files in a folder. Some systems leave a hidden file beside each (._castle.scene)."""
+    return sorted(path for path in folder.glob(_SCENES) if path.is_file())
 
 
 def say_what_to_do(run: str | Path, has_words: bool) -> None:
@@ -52,8 +63,14 @@ def say_what_to_do(run: str | Path, has_words: bool) -> None:
         say(f"Ask it:          lang3dxl query {place} --text windows --out found")
 
 
-def _began(config: Path) -> float:
-    """Return when a run began: by its folder's name, or else by the file's time, which a copy changes."""
+def _config(folder: Path) -> Path:
+    return folder / "config.yml"
+
+
+def _began(folder: Path) -> float:
+    """Return when a run began: by its folder's name, or else by the time of its first file, which a copy
+    changes."""
     with suppress(ValueError):
-        return datetime.strptime(config.parent.name, "%Y-%m-%d_%H%M%S").timestamp()
-    return config.stat().st_mtime
+        return datetime.strptime(folder.name, "%Y-%m-%d_%H%M%S").timestamp()
+    written = _config(folder), folder / SCENE_FILE, *scenes_in(folder)
+    return next(path.stat().st_mtime for path in written if path.is_file())

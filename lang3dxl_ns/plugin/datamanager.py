@@ -34,7 +34,7 @@ from lang3dxl_ns.preparation.needs import needs_table
 from lang3dxl_ns.preparation.settings import PreparationConfig
 from lang3dxl_ns.preparation.targets import FACTS, Batch, SceneFacts
 from lang3dxl_ns.scene.camera import LONGEST_SIDE
-from lang3dxl_ns.scene.capture import recorded_capture
+from lang3dxl_ns.scene.capture import recorded_capture, say_held_out
 from lang3dxl_ns.scene.companions import cache_folder
 from lang3dxl_ns.scene.record import SCENE_FILE, SceneRecord
 from lang3dxl_ns.training.batches import TrainingData
@@ -128,12 +128,7 @@ class Lang3DXLDataManager(FullImageDatamanager):
     def setup_train(self) -> None:
         """Prepare missing targets before training; give the model their statistics and the scene's needs."""
         if self.test_mode == "val":
-            photos, trained = len(self.data.capture.photos), len(self.data.capture.split.train)
-            if trained < photos:
-                say(
-                    f"{photos - trained} of {photos} photos are held out of training, for evaluation "
-                    "(`lang3dxl-colmap --eval-mode all` after all other options trains on all)"
-                )
+            say_held_out(self.data.capture)
             say(needs_table(self.data.needs))
             self.train_dataset.metadata[FACTS] = self.data.facts()
 

@@ -11,7 +11,6 @@ import torch
 
 from lang3dxl_ns.common.device import known_device
 from lang3dxl_ns.common.errors import UserError, readable
-from lang3dxl_ns.evaluation.score_run import NOT_FINISHED
 from lang3dxl_ns.files.runs import find_config
 from lang3dxl_ns.plugin.model import Lang3DXLModelConfig
 from lang3dxl_ns.plugin.run_checkpoint import latest_checkpoint
@@ -19,6 +18,7 @@ from lang3dxl_ns.plugin.run_settings import read_model_config
 from lang3dxl_ns.preparation.targets import SceneFacts
 from lang3dxl_ns.query.question import QueryConfig
 from lang3dxl_ns.query.scene import Scene
+from lang3dxl_ns.query.text import NOT_FINISHED
 from lang3dxl_ns.scene.record import SCENE_FILE, SceneRecord
 from lang3dxl_ns.training.snapshot import snapshot
 from lang3dxl_ns.training.state import Training

@@ -20,6 +20,7 @@ from lang3dxl_ns.common.worker import Worker
 from lang3dxl_ns.plugin.model import Lang3DXLModel
 from lang3dxl_ns.plugin.viewer_guard import guard_viewers
 from lang3dxl_ns.query.match import Found
+from lang3dxl_ns.query.text import NO_SEMANTICS
 from lang3dxl_ns.scene.camera import Camera
 from lang3dxl_ns.scene.record import SceneRecord, overview
 from lang3dxl_ns.things.thing import Thing
@@ -34,7 +35,6 @@ INVITATION = (
     'Type what to look for: `rose window`, several as `dome; towers`, or `"windows" not "doors"`. '
     "A finished run has a richer page: `lang3dxl view`."
 )
-NO_SEMANTICS = "This run has no semantics (it was trained with clip none)."
 _NOWHERE = "…"
 _TYPING = 0.5
 """Seconds after the last keystroke until the text takes effect."""

@@ -31,7 +31,7 @@ from lang3dxl_ns.common.memory import ran_out_of_memory
 from lang3dxl_ns.common.options import data_option
 from lang3dxl_ns.common.stages import Stages
 from lang3dxl_ns.common.stopping import stoppable
-from lang3dxl_ns.files.runs import say_what_to_do
+from lang3dxl_ns.files.runs import say_what_to_do, scenes_in
 from lang3dxl_ns.files.scene_file import SUFFIX, Provenance, replace_scene
 from lang3dxl_ns.plugin.optimizers import GuardedOptimizers
 from lang3dxl_ns.plugin.pipeline import Lang3DXLPipeline, Lang3DXLPipelineConfig
@@ -368,7 +368,7 @@ class Lang3DXLTrainer(Trainer):
         file.write(self.base_dir / SCENE_FILE)
         scene = snapshot(model.run, file)
         checkpoints = self.config.load_dir or (place and place.parent)
-        earlier = sorted(checkpoints.parent.glob(f"[!.]*{SUFFIX}")) if checkpoints else []  # may be renamed
+        earlier = scenes_in(checkpoints.parent) if checkpoints else []  # may be renamed
         told = Provenance(title=path.stem, made_how=how)
         _, size = replace_scene(path, scene, told, *earlier)
         say(f"The scene:       {os.path.relpath(path)} ({size / 1e6:.1f} MB)")

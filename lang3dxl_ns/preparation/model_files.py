@@ -16,6 +16,7 @@ import torch
 from lang3dxl_ns.common.errors import UserError, readable
 from lang3dxl_ns.common.files import check_regular, expanded
 from lang3dxl_ns.common.options import data_option
+from lang3dxl_ns.preparation.settings import DENSE_MODEL
 
 CLIP_OPTION, DENSE_OPTION = "clip", "dense"
 
@@ -73,15 +74,19 @@ def find_model(name_or_dir: str | Path, option: str) -> ModelFiles:
     return ModelFiles(name, folder, _fingerprint(folder, option), option)
 
 
-def usual_clip(clip: str) -> str:
-    """Resolve the image-text encoder "auto": OpenAI's CLIP if it is in the Hugging Face cache, otherwise the
-    built-in one, so that nothing is downloaded unasked. Another name is returned as it is."""
+def usual_clip(clip: str, dense: str) -> str:
+    """Resolve the image-text encoder "auto": OpenAI's CLIP if it is in the Hugging Face cache, and the dense
+    encoder that "auto" takes with it too, otherwise the built-in one, so that nothing is downloaded unasked.
+    Another name is returned as it is."""
     from huggingface_hub import try_to_load_from_cache
 
     if clip != "auto":
         return clip
-    files = (try_to_load_from_cache(USUAL_CLIP, n) for n in ("model.safetensors", "pytorch_model.bin"))
-    return USUAL_CLIP if any(isinstance(file, str) for file in files) else BUILTIN
+    wanted, names = [USUAL_CLIP], ("model.safetensors", "pytorch_model.bin")
+    if dense == "auto":
+        wanted.append(DENSE_MODEL)
+    here = all(any(isinstance(try_to_load_from_cache(model, n), str) for n in names) for model in wanted)
+    return USUAL_CLIP if here else BUILTIN
 
 
 class _NotDownloaded(UserError):

@@ -43,8 +43,8 @@ class PreparationConfig:
     encoders). fast: at most 700. fine: no bound, about 10,000 in a photo of 1,600 pixels."""
     clip: str = "auto"
     """CLIP, SigLIP or another image-text encoder in Hugging Face format (docs/encoders.md): a name, a folder,
-    or builtin. auto: openai/clip-vit-base-patch32 if it was downloaded before, otherwise the built-in one.
-    The paper uses the former, fine-tuned on landmarks."""
+    or builtin. auto: openai/clip-vit-base-patch32 if it and its dense encoder were downloaded before,
+    otherwise the built-in one. The paper uses the former, fine-tuned on landmarks."""
     clip_features: ClipFeatures = "auto"
     """How the image-text encoder reads photos. crops: one vector for each of thousands of crops. dense: a map
     of patch features in about ten passes. auto: dense if its patches were trained to match texts (TIPSv2),

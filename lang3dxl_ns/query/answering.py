@@ -17,7 +17,7 @@ from lang3dxl_ns.query.doubt import DOUBTFUL, Doubts
 from lang3dxl_ns.query.engine import QueryEngine, make_engine
 from lang3dxl_ns.query.relevancy import Queries
 from lang3dxl_ns.query.rendered_scene import RenderedScene
-from lang3dxl_ns.query.text import NO_SEMANTICS, EncodeTexts, Prompt, TextEncoder, text_encoder
+from lang3dxl_ns.query.text import EncodeTexts, Prompt, TextEncoder, text_encoder, why_no_words
 from lang3dxl_ns.query.thresholds import match_thresholds, matching
 from lang3dxl_ns.query.trust import ANCHORS, foreignness
 from lang3dxl_ns.query.visibility import VisibleGaussians, measured
@@ -88,9 +88,9 @@ class Answering(RenderedScene):
     # ── features ────────────────────────────────────────────────────────────────────────────────────
 
     def semantics(self) -> tuple[Decoder, Float[Tensor, "n d"]]:
-        """The decoder and the codes. Raises UserError for a scene with colors only."""
+        """The decoder and the codes. Raises UserError for a scene without words."""
         if self.decoder is None or self.codes is None:
-            raise UserError(NO_SEMANTICS)
+            raise UserError(why_no_words(self.file))
         return self.decoder, self.codes
 
     @cached_property

@@ -47,7 +47,8 @@ class Scene(Answering):
 
     def __repr__(self) -> str:
         held_out = sum(photo.held_out for photo in self.photos)
-        words = f"CLIP {self.file.clip}" if self.decoder is not None else "only colors"
+        colors = "only colors" if self.file.clip is None else "no words yet"
+        words = f"CLIP {self.file.clip}" if self.decoder is not None else colors
         return (
             f"Scene({len(self.splats):,} Gaussians, {len(self.photos)} photos ({held_out} held out) "
             f"of {self.file.data}, {words})"

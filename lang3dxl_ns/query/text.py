@@ -26,6 +26,10 @@ from lang3dxl_ns.words.taught_words import TaughtWord, known_word
 EncodeTexts = Callable[[list[str]], Float[Tensor, "n c"]]
 """Function that encodes texts, such as `ImageTextEncoder.encode_texts`."""
 NO_SEMANTICS = "this scene has only colors (it was trained with clip none): it can't be queried"
+NOT_FINISHED = (
+    "this scene has no words yet: they are learned when training ends; resume it (lang3dxl train: the same "
+    "command again)"
+)
 
 _SAME = 0.95
 """Cosine from which a vector and a phrase are taken to mean the same."""
@@ -202,6 +206,11 @@ class TextEncoder:
         if not texts:
             return self.vectors(NEGATIVES[:1])[:0]
         return torch.stack([self._vectors[text] for text in texts])
+
+
+def why_no_words(file: SceneRecord) -> str:
+    """Say why a scene without words can't be queried: it has only colors, or its training has not ended."""
+    return NO_SEMANTICS if file.clip is None else NOT_FINISHED
 
 
 def text_encoder(file: SceneRecord, device: torch.device | str) -> EncodeTexts:

@@ -21,6 +21,7 @@ from torch import Tensor
 from lang3dxl_ns.common.console import say, some
 from lang3dxl_ns.common.errors import UserError, printable, readable
 from lang3dxl_ns.common.files import expanded, read_names
+from lang3dxl_ns.common.options import capture_option
 from lang3dxl_ns.scene.camera import camera_to_world, view_matrix
 from lang3dxl_ns.scene.capture_settings import CaptureSettings
 from lang3dxl_ns.scene.colmap import Reconstruction, TrackedPhoto, photos_in_model, read_reconstruction
@@ -218,7 +219,8 @@ def open_capture(
         first = next(iter(capture.left_out.items()), ("", "it lists none"))
         raise UserError(
             f"none of the {len(capture.left_out)} photos of {folder} can be used; the first: "
-            f"{': '.join(first)}. Put them into images/ there (ns-train: or lang3dxl-colmap --images-path)"
+            f"{': '.join(first)}. Put them into images/ there, or name their folder "
+            f"({capture_option('images-path')})"
         )
     capture = _without_lost_cameras(capture)
     centers = np.array([tracked.center for tracked in capture.reconstruction.photos.values()])
@@ -413,3 +415,12 @@ def say_left_out(capture: Capture) -> None:
         used = frozenset().union(*capture.split)
         unused = {name: why for name, why in capture.contradicted.items() if name not in used}
         say(*reasons_in_words({"doubtfully placed, and not used": unused}))
+
+
+def say_held_out(capture: Capture) -> None:
+    """Say how many photos training does without, and how it would use them."""
+    if held_out := set(capture.split.held_out) - set(capture.split.train):
+        say(
+            f"{len(held_out)} of {len(capture.photos)} photos are held out of training, for evaluation "
+            f"({capture_option('eval-mode')} all trains on all that no list holds out)"
+        )

@@ -30,10 +30,12 @@ class CaptureSettings:
     eval_mode: Literal["interval", "all"] = "interval"
     """Rule for the held-out photos: every `eval_interval`-th one in the order of names, or none."""
     eval_interval: int = 8
+    """Number of photos of which one is held out."""
     orientation_method: Orientation = "up"
-    """Direction that becomes z in training: see `find_frame`."""
+    """Direction that becomes z in training. up: the mean of the cameras' up axes. vertical: what is
+    orthogonal to their right axes. none: the capture's own."""
     center_method: Center = "poses"
-    """Origin in training: see `find_frame`."""
+    """Origin in training: the mean of the cameras (poses), or the capture's own (none)."""
     auto_scale_poses: bool = True
     """Whether the farthest coordinate of a camera becomes 1 in training."""
     scale_factor: float = 1.0

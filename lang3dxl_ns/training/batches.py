@@ -44,7 +44,7 @@ MOST_GONE = 0.1
 def settled(config: Prepared, learned: bool, gathered: bool) -> Prepared:
     """Return the settings of the targets without `auto`: semantics `learned` with the scene use regions in
     every step; features `gathered` onto Gaussians, also those that codes start from, need fine crops."""
-    config = replace(config, clip=usual_clip(config.clip))
+    config = replace(config, clip=usual_clip(config.clip, config.dense))
     crops, regions = config.crops, config.regions
     if crops == "auto":
         crops = "fine" if gathered else "pyramid"

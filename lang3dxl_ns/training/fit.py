@@ -24,13 +24,14 @@ from lang3dxl_ns.common.stages import Stages
 from lang3dxl_ns.common.stopping import stoppable
 from lang3dxl_ns.files.scene_file import SUFFIX, Provenance, replace_scene
 from lang3dxl_ns.preparation.model_files import check_encoders
-from lang3dxl_ns.preparation.needs import needs_table
+from lang3dxl_ns.preparation.needs import needs_table, write_needs
 from lang3dxl_ns.preparation.settings import PreparationConfig
 from lang3dxl_ns.query.scene import Scene
-from lang3dxl_ns.scene.capture import Capture, open_capture, say_left_out
+from lang3dxl_ns.scene.capture import Capture, open_capture, say_held_out, say_left_out
 from lang3dxl_ns.scene.capture_settings import CaptureSettings
 from lang3dxl_ns.scene.companions import cache_folder
 from lang3dxl_ns.scene.photo_folder import check_data
+from lang3dxl_ns.scene.record import SCENE_FILE
 from lang3dxl_ns.training.batches import TrainingData, settled
 from lang3dxl_ns.training.checkpoint import CHECKPOINT, as_damage, read_checkpoint, save_checkpoint
 from lang3dxl_ns.training.estimate import check_device, estimate
@@ -307,6 +308,8 @@ def begin(capture: Capture, settings: Settings, out: Path, cache_dir: Path, devi
     torch.manual_seed(settings.seed)
     run = Run(capture, settings, out, cache_dir, device)
     run.resume()
+    run.data.record(run.state).write(out / SCENE_FILE)
+    write_needs(run.data.needs, out)
     return run
 
 
@@ -316,7 +319,8 @@ def fit(capture: Capture, settings: Settings, out: Path, cache_dir: Path, device
     Args:
         capture: photos with cameras and points.
         settings: settings of the run.
-        out: folder of the run; it gets NAME.scene, also at every checkpoint, and the checkpoint.
+        out: folder of the run; it gets NAME.scene, also at every checkpoint, the checkpoint, and records of
+            the photos and of what they need.
         cache_dir: folder of prepared targets.
         device: by default a GPU if there is one.
 
@@ -340,6 +344,7 @@ def run_folder(
     check_encoders(settings.targets.clip, settings.targets.dense)
     capture = open_capture(data, settings.capture, settings.targets.cache_dir)
     say_left_out(capture)
+    say_held_out(capture)
     folder = Path("outputs") / (capture.folder.name or "scene") if out is None else expanded(out)
     if restart:
         (folder / CHECKPOINT).unlink(missing_ok=True)
@@ -361,7 +366,7 @@ def train(
     Args:
         data: folder of photos, with or without a COLMAP model or transforms.json, or a video.
         out: folder of the run, in which NAME.scene is written; by default outputs/NAME.
-        steps: iterations; by default 30,000 (70,000 as printed) on a GPU and 3,000 without one.
+        steps: iterations; by default 30,000 (70,000 for `lang3dxl-paper`) on a GPU and 3,000 without one.
         method: `lang3dxl`, or `lang3dxl-paper` as printed.
         restart: train anew, over the run in the folder.
         **settings: settings of `TrainingSettings`, `PreparationConfig`, `CaptureSettings` and `Settings` by

@@ -23,8 +23,8 @@ export function say(message, usual = false) {
 }
 
 /** Say what can be asked. known: the words that the page answers, once it has read what the scene means. */
-export function explain({ count, detail, known, live, words, foreground }) {
-  if (!words) return "This scene has only colors: it can't be asked.";
+export function explain({ count, detail, known, live, words, wordless, foreground }) {
+  if (!words) return sentence(wordless);
   if (!known) return "Reading what the scene means…";
   const within = foreground.length ? ` Matches lie on ${foreground.map(([text]) => shown(text)).join(" or ")}.` : "";
   return `${(detail?.count ?? count).toLocaleString("en")} Gaussians. ${live ? "Ask for anything." : `Ask for any of ${known.length.toLocaleString("en")} words.`}${within}`;

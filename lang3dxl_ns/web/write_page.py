@@ -28,7 +28,7 @@ from lang3dxl_ns.query.heat_maps import PROMPT_COLORS
 from lang3dxl_ns.query.language import TABLE
 from lang3dxl_ns.query.negatives import CLEAR, NOTHING, competitors
 from lang3dxl_ns.query.scene import Scene
-from lang3dxl_ns.query.text import NO_SEMANTICS, Prompt, tidy
+from lang3dxl_ns.query.text import Prompt, tidy, why_no_words
 from lang3dxl_ns.query.thresholds import EVEN, SHARE
 from lang3dxl_ns.query.trust import ALIKE, ANCHORS, CLEARLY, FAINT, FAR, STRICTER, STRICTEST
 from lang3dxl_ns.query.visibility import spread
@@ -112,7 +112,7 @@ class Page:
 
     def __post_init__(self) -> None:
         """Parse prompts, merge the Gaussians of a large scene, and pack what Gaussians mean. Raises UserError
-        if that is too large for a page, or if a scene with colors alone is asked for texts."""
+        if that is too large for a page, or if a scene without words is asked for texts."""
         self.whole = self.scene
         self.levels: Levels | None = None
         if len(self.scene.splats) > self.large:
@@ -128,7 +128,7 @@ class Page:
         if scene.decoder is not None and scene.codes is not None:
             self._meaning = pack.packed_meaning(scene.decoder, scene.codes)
         elif self.texts:
-            raise UserError(NO_SEMANTICS)
+            raise UserError(why_no_words(scene.file))
 
     def files(self) -> dict[str, bytes]:
         """Build the content of every file, by name."""
@@ -216,7 +216,7 @@ class Page:
         it flies to."""
         scene, meaning = self.scene, self._meaning
         if meaning is None:
-            return {"words": None, "names": [], "suggested": []}, {}
+            return {"words": None, "wordless": why_no_words(scene.file), "names": [], "suggested": []}, {}
         rules = {
             "temperature": scene.engine.temperature,
             "threshold": scene.config.threshold,
@@ -314,9 +314,9 @@ class Page:
 
     def answer(self, phrase: str) -> dict[str, Any]:
         """Express a phrase in this scene's numbers: itself, what is searched for, and what it competes with.
-        Raises UserError if the phrase is empty, or the scene has colors only."""
+        Raises UserError if the phrase is empty, or the scene has no words."""
         if self._meaning is None:
-            raise UserError(NO_SEMANTICS)
+            raise UserError(why_no_words(self.scene.file))
         text = tidy(phrase[:MOST_TEXT].encode("utf-8", "ignore").decode())
         if not text:
             raise UserError("the prompt is empty: type what to look for, such as rose window")

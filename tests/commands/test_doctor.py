@@ -55,10 +55,12 @@ def test_what_gsplat_needs_is_named(monkeypatch, tmp_path):
 
 def test_versions_are_checked_against_the_requirements(monkeypatch):
     monkeypatch.setattr(doctor, "version", lambda name: "1.0" if name == "gsplat" else "9999.1")
-    monkeypatch.setattr(doctor, "requires", lambda _: ["gsplat==1.4.0", "torch>=2.6", "ray; extra == 'ray'"])
+    monkeypatch.setattr(
+        doctor, "requires", lambda _: ["gsplat==1.4.0", "torch>=2.6", "ray; extra == 'ray'", "torch<9999"]
+    )
     found = {finding.what: finding for finding in doctor.versions()}
-    assert set(found) == {"Python", "nerfstudio", "gsplat", "torch"}
-    assert found["torch"].verdict == "ok"
+    assert set(found) == {"Python", "nerfstudio", "gsplat", "torch"} and len([*doctor.versions()]) == 4
+    assert found["torch"].verdict == "problem" and "<9999" in found["torch"].remedy
     assert found["gsplat"].verdict == "problem"
     assert "gsplat==1.4.0" in found["gsplat"].remedy
     monkeypatch.setattr(doctor, "findings", lambda: iter([found["gsplat"]]))

@@ -68,6 +68,37 @@ def test_the_help_has_the_settings_in_order_and_names_their_kind_alone(monkeypat
     assert said.index("--out") < said.index("--often")
 
 
+@pytest.mark.parametrize("shown", [("place", "long"), ("place", "long", "rarely")])
+def test_the_help_is_in_paragraphs_and_names_what_it_hides(monkeypatch, capsys, shown):
+    """Continuation lines of a text begin with spaces, at which tyro would break it; what may be absent is in
+    brackets."""
+    monkeypatch.setattr(sys, "argv", ["lang3dxl", "train", "--help"])
+    monkeypatch.setenv("COLUMNS", "200")
+
+    @dataclass
+    class Inherited:
+        long: int = 1
+        """One sentence that goes on
+        in a second line."""
+
+    @showing(*shown)
+    @dataclass
+    class Command(Inherited):
+        """Do something."""
+
+        place: tyro.conf.Positional[Path | None] = None
+        """Folder."""
+        rarely: int = 2
+
+        def main(self) -> None: ...
+
+    with contextlib.suppress(SystemExit):
+        tyro.cli(Command, args=["--help"])
+    said = capsys.readouterr().out
+    assert "One sentence that goes on in a second line." in said and "[PATH]  " in said
+    assert ("--help-all" in said) is ("rarely" not in said) is ("rarely" not in shown)
+
+
 def count() -> None:
     """Prints how many settings the help of ns-train shows, and how many flags that of all our commands, which
     are imported anew: classes of settings look for --help."""

@@ -126,6 +126,19 @@ def test_export_refuses_options_without_effect(run, tmp_path, target, option):
         run("export", "c", target, tmp_path / name, option, "dome")
 
 
+@pytest.mark.parametrize(
+    ("option", "name", "message"),
+    [
+        (("--all",), "a.spz", r"a\.spz can't hold relevancies: write a \.ply"),
+        (("--size", 300), "a.ply", "--size is that of pictures"),
+    ],
+)
+def test_export_refuses_what_its_file_cant_hold(run, tmp_path, option, name, message):
+    with pytest.raises(SystemExit, match=message):
+        run("export", "c", "--text", "dome", "--out", tmp_path / name, *option)
+    assert not (tmp_path / name).exists()
+
+
 @pytest.mark.parametrize("target", ["--scene-file", "--out"])
 @pytest.mark.parametrize("option", [("--threshold", 0.9), ("--size", 300), ("--synonyms", "off")])
 def test_export_refuses_settings_of_queries_without_a_text(run, tmp_path, target, option):

@@ -9,16 +9,27 @@ from scenes import write_scene
 import lang3dxl_ns
 from lang3dxl_ns import cli
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.open_scene import existing_scene_file
+from lang3dxl_ns.preparation.needs import read_needs
 from lang3dxl_ns.training import fit as fitting
 from lang3dxl_ns.training.fit import Settings
+from lang3dxl_ns.web.photos import folder_of_run
 
 
-def test_short_names_reach_the_settings_and_the_folder_opens(tmp_path, capsys):
-    data, out = write_scene(tmp_path / "scene", photos=4, points=60), tmp_path / "run"
-    words = ["train", str(data), "--out", str(out), "--steps", "3", "--clip", "none"]
+def test_short_names_reach_the_settings_and_the_folder_opens(tmp_path, capsys, monkeypatch):
+    """Unnamed, as the newest run here, and with its photos and measured needs."""
+    monkeypatch.chdir(tmp_path)
+    data, out = write_scene(tmp_path / "scene", photos=4, points=60), tmp_path / "outputs" / "scene"
+    words = ["train", str(data), "--steps", "3", "--clip", "none"]
     cli.main([*words, "--sky-gaussians", "50", "--view-dependence", "off", "--looks", "off"])
-    assert "lang3dxl view" in capsys.readouterr().out
-    scene = lang3dxl_ns.load_scene(out)
+    said = " ".join(capsys.readouterr().out.split())
+    assert "lang3dxl view" in said and "1 of 4 photos are held out of training" in said
+    assert "(--eval-mode all trains on all" in said
+    assert folder_of_run(existing_scene_file()) == data and read_needs(out)["view dependence"] in (
+        True,
+        False,
+    )
+    scene = lang3dxl_ns.load_scene()
     assert scene.splats.degree == 0
     means = torch.load(out / "training.ckpt", weights_only=True)["tensors"]["gauss_params.means"]
     assert len(means) == len(scene.splats)

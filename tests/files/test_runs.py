@@ -6,8 +6,8 @@ import shutil
 import pytest
 
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.files.runs import find_config
-from lang3dxl_ns.open_scene import existing_scene_file
+from lang3dxl_ns.files.runs import find_config, find_run
+from lang3dxl_ns.open_scene import existing_scene_file, find_scene_file
 from lang3dxl_ns.scene.record import SCENE_FILE
 
 
@@ -72,6 +72,25 @@ def test_folders_without_a_run_say_how_to_make_one(tmp_path, monkeypatch):
         find_config()
     with pytest.raises(UserError, match=r"holds no run.*lang3dxl train"):
         find_config(tmp_path)
+
+
+def test_a_run_is_found_by_its_scene_file_too_and_a_word_taught_later_makes_it_no_newer(runs, tmp_path):
+    """`lang3dxl train` writes a scene and no config.yml; teaching writes into the scene."""
+    folder = tmp_path / "outputs" / "c"
+    folder.mkdir()
+    record, scene, hidden = folder / SCENE_FILE, folder / "c.scene", runs[0].with_name("._a.scene")
+    for path in (record, hidden):
+        path.touch()
+    assert find_run().resolve() == runs[1].parent  # neither is a scene yet
+    scene.touch()
+    for began, newest in ((5000, folder), (500, runs[1].parent)):
+        os.utime(record, (began, began))
+        os.utime(scene, (9000, 9000))
+        for place in (None, "outputs"):
+            assert find_run(place).resolve() == newest
+            found = find_scene_file(place)
+            assert found is None if newest == runs[1].parent else scene.samefile(found)
+    assert find_run("outputs/c") == folder.relative_to(tmp_path) and find_run(scene) == scene
 
 
 def test_a_run_with_a_copy_of_its_scene_asks_which_is_meant(runs):

@@ -122,6 +122,13 @@ def test_a_miss_is_reported_in_words_and_makes_the_exit_code_1(tmp_path, monkeyp
     assert (tmp_path / "numerics.png").read_bytes().startswith(b"\x89PNG")
 
 
+def test_a_missing_library_is_named_before_anything_is_measured(tmp_path, monkeypatch):
+    monkeypatch.setattr(command, "find_spec", lambda _: None)
+    monkeypatch.setattr(command, "all_cases", lambda *_: pytest.fail("measured"))
+    with pytest.raises(SystemExit, match=r"needs matplotlib: pip install -e '\.\[lab\]'"):
+        cli.main(["numerics", "--out", str(tmp_path)])
+
+
 def test_the_catalog_holds_every_group():
     components = {case.component for case in catalog.all_cases(quick=True, device="cpu")}
     assert {"appearance", "relevancy"} <= components

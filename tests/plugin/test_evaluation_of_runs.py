@@ -134,6 +134,17 @@ def test_evaluate_run_writes_the_report_of_a_run(trainer, scene, tmp_path):
     assert "taught_words_left_out" not in report["results"]["protocol"]
 
 
+def test_a_scene_file_is_scored_with_the_clip_that_is_named_and_a_run_with_its_own(trainer, scene, tmp_path):
+    truth, (file,) = label(scene, tmp_path / "truth", (0, 1)), trainer.base_dir.glob("*.scene")
+    for place, message in (
+        (file, "is not the one that this scene was made with"),
+        (file.parent, "--clip is for"),
+    ):
+        words = ["evaluate", "run", str(place), "--ground-truth", str(truth), "--out", str(tmp_path / "out")]
+        with pytest.raises(SystemExit, match=message):
+            cli.main([*words, "--clip", "builtin"])
+
+
 def test_a_run_is_scored_by_text_alone_and_says_which_taught_words_that_leaves_out(
     trainer, scene, tmp_path, capsys, monkeypatch
 ):

@@ -251,9 +251,11 @@ def test_an_encoder_that_is_here_is_not_asked_for(tiny_clip):
 def test_without_a_download_the_clip_is_the_built_in_one(monkeypatch, tmp_path):
     import huggingface_hub
 
-    assert usual_clip("auto") == "builtin" and usual_clip("some/clip") == "some/clip"
-    cached = {"model.safetensors": str(tmp_path), "config.json": str(tmp_path)}
-    monkeypatch.setattr(huggingface_hub, "try_to_load_from_cache", lambda _, name: cached.get(name))
-    assert usual_clip("auto") == USUAL_CLIP
-    del cached["model.safetensors"]  # an interrupted download
-    assert usual_clip("auto") == "builtin"
+    assert usual_clip("auto", "auto") == "builtin" and usual_clip("some/clip", "auto") == "some/clip"
+    cached = {(model, n): str(tmp_path) for model in (USUAL_CLIP, DINO) for n in ("model.safetensors", "x")}
+    monkeypatch.setattr(huggingface_hub, "try_to_load_from_cache", lambda *file: cached.get(file))
+    assert usual_clip("auto", "auto") == USUAL_CLIP
+    del cached[DINO, "model.safetensors"]  # it would be downloaded
+    assert usual_clip("auto", "auto") == "builtin" and usual_clip("auto", "none") == USUAL_CLIP
+    del cached[USUAL_CLIP, "model.safetensors"]  # an interrupted download
+    assert usual_clip("auto", "none") == "builtin"

@@ -232,11 +232,13 @@ def test_mistakes_are_reported(scene):
         scene.render("0002", look="0002")
 
 
-def test_a_scene_of_colors_alone_can_be_seen_but_not_asked():
-    scene = Scene(painted_splats(), painted_file())
-    assert scene.render("0003").pixels.any() and "only colors" in repr(scene)
+@pytest.mark.parametrize(("clip", "why"), [(None, "only colors"), ("clip", "no words yet")])
+def test_a_scene_without_words_can_be_seen_but_not_asked_and_says_why(clip, why):
+    """Words of a scene with a CLIP are learned when its training ends."""
+    scene = Scene(painted_splats(), replace(painted_file(), clip=clip))
+    assert scene.render("0003").pixels.any() and why in repr(scene)
     for ask in (scene.query, scene.find, scene.relevancy, scene.encode):
-        with pytest.raises(UserError, match="only colors"):
+        with pytest.raises(UserError, match=why):
             ask("dome")
 
 

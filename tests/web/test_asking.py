@@ -273,17 +273,17 @@ def test_without_webgl_it_says_what_helps(browser, address):
 
 
 @pytest.mark.slow
-def test_colors_alone_cant_be_typed_to(browser, tmp_path):
+def test_a_scene_without_words_cant_be_typed_to(browser, tmp_path):
     write_page(Page(painted_scene(decoder=None, codes=None)), tmp_path)
     with served(tmp_path) as address:
         page = opened(browser, address + "#ask=dome&like=it~1", DESK)
         assert page.get_by_role("combobox", name="Look for").is_disabled()
         assert page.get_by_role("button", name="Ask").is_disabled() and prompts_of(page) == []
-        until_told(page, "#status", "only colors")
+        until_told(page, "#status", "no words yet")
         page.get_by_role("button", name="Walk").click()
         page.get_by_role("button", name="Overview").click()
         until(page, "document.getElementById('walk').ariaPressed", "false")
-        until_told(page, "#status", "only colors")
+        until_told(page, "#status", "no words yet")
         assert page.complaints == []
         page.close()
 

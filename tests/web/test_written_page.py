@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import torch
 from pages import field_scene
-from painted_scene import painted_looks, painted_scene, painted_splats
+from painted_scene import painted_file, painted_looks, painted_scene, painted_splats
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import read_names
-from lang3dxl_ns.query.text import NO_SEMANTICS
+from lang3dxl_ns.query.text import NO_SEMANTICS, NOT_FINISHED
 from lang3dxl_ns.query.vocabulary import common_words, shipped_vocabulary, whole_words
 from lang3dxl_ns.web.photos import extent
 from lang3dxl_ns.web.write_page import _DATA, Page, write_page
@@ -115,10 +115,12 @@ def test_a_decoder_too_wide_for_a_page_is_refused_in_a_sentence(monkeypatch, sce
         Page(scene)
 
 
-def test_colors_alone_make_a_page_that_cant_be_asked(scene):
-    bare = painted_scene(decoder=None, codes=None)
-    assert json.loads(Page(bare).files()["scene.json"])["words"] is None
-    with pytest.raises(UserError, match=re.escape(NO_SEMANTICS)):
+@pytest.mark.parametrize(("clip", "why"), [(None, NO_SEMANTICS), ("clip", NOT_FINISHED)])
+def test_a_scene_without_words_makes_a_page_that_says_why_it_cant_be_asked(clip, why):
+    bare = painted_scene(file=replace(painted_file(), clip=clip), decoder=None, codes=None)
+    told = json.loads(Page(bare).files()["scene.json"])
+    assert (told["words"], told["wordless"]) == (None, why)
+    with pytest.raises(UserError, match=re.escape(why)):
         Page(bare, ["dome"])
 
 
