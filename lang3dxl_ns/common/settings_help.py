@@ -53,7 +53,8 @@ def _describe(kind: type) -> None:
     parsed = [parse_from_object(base) for base in reversed(kind.__mro__[:-1])]
     texts = {text.arg_name: text.description for one in parsed for text in one.params}
     for field in fields(kind):
-        hint, shown = hints[field.name], {"help": " ".join((texts.get(field.name) or "").split()) or None}
+        hint, text = hints[field.name], " ".join((texts.get(field.name) or "").split())
+        shown: dict[str, Any] = {"help": text or None}
         bare, marks = getattr(hint, "__origin__", hint), getattr(hint, "__metadata__", ())  # of Annotated
         kinds = [option for option in get_args(bare) if option is not NoneType]
         if field.default is None and len(kinds) == 1 and isinstance(kinds[0], type):
