@@ -46,7 +46,9 @@ class Reconstruct(ReconstructionSettings):
             model = add_photos(self.data, self.add, self.cache_dir, self)
             return say(f"The model is in {model}")
         data, model = reconstruct_scene(self.data, self.cache_dir, self)
-        say(f"The model is in {model}. Train with: lang3dxl train {shlex.quote(str(data))}")
+        words = ["lang3dxl", "train", str(data)]
+        words += ["--cache-dir", str(self.cache_dir)] if self.cache_dir else []
+        say(f"The model is in {model}. Train with: {shlex.join(words)}")
 
 
 @showing("data", "clip", "quality", "foreground", "workers", "cache_dir")
@@ -84,7 +86,7 @@ class Needs(PreparationConfig, CaptureSettings):
     """
 
     data: Path
-    """Folder with images/ and sparse/0/."""
+    """Folder of photos, with images/ and sparse/0/ or without a model, or a video."""
 
     def main(self) -> None:
         from lang3dxl_ns.preparation.needs import needs_table

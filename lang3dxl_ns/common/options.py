@@ -14,6 +14,13 @@ def data_option(name: str) -> str:
     return f"{'--pipeline.datamanager.' if _in_nerfstudio() else '--'}{name}"
 
 
+def capture_option(name: str) -> str:
+    """Spell an option of where a capture's parts are, such as `masks-path`: nerfstudio's commands have it
+    after a word of its own, at the end (see `data_option`)."""
+    before = "lang3dxl-colmap"
+    return f"{before} --{name}" if _in_nerfstudio() else f"--{name}"
+
+
 def model_option(name: str) -> str:
     """Spell an option of the model, such as `max-gaussians` (see `data_option`)."""
     return f"--pipeline.model.{name}" if _in_nerfstudio() else f"--{OWN_NAMES.get(name, name)}"
