@@ -20,7 +20,7 @@ from lang3dxl_ns.attachment import direction_of
 from lang3dxl_ns.attachment.upright import BACKGROUND, CERTAIN, find_up, name_of_axis
 from lang3dxl_ns.common.console import say, tracked
 from lang3dxl_ns.common.errors import DAMAGE, UserError
-from lang3dxl_ns.common.files import make_folder, read_json, replace_file
+from lang3dxl_ns.common.files import make_folder, own_folder, read_json, replace_file
 from lang3dxl_ns.query.match import as_bytes, save_picture
 from lang3dxl_ns.query.visibility import fingerprint
 from lang3dxl_ns.rendering import Rendering, Splats, composite, render
@@ -115,7 +115,7 @@ def rendered_views(splats: Splats, count: int, up: str, folder: Path) -> Capture
     the splat well."""
     how = [_RULE, count, up, splats.antialiased]
     stamp = fingerprint(vars(splats.gaussians) | {"harmonics": splats.harmonics}, how)
-    kept = _kept(folder, stamp)
+    kept = _kept(own_folder(folder), stamp)
     cameras = kept or choose_views(splats, Extent.of(splats, up), count)
     background = splats.means.new_tensor(BACKGROUND)
     names = [f"{i:04d}.png" for i in range(len(cameras))]

@@ -46,7 +46,9 @@ class Reconstruct(ReconstructionSettings):
             model = add_photos(self.data, self.add, self.cache_dir, self)
             return say(f"The model is in {model}")
         data, model = reconstruct_scene(self.data, self.cache_dir, self)
-        say(f"The model is in {model}. Train with: lang3dxl train {shlex.quote(str(data))}")
+        words = ["lang3dxl", "train", str(data)]
+        words += ["--cache-dir", str(self.cache_dir)] if self.cache_dir else []
+        say(f"The model is in {model}. Train with: {shlex.join(words)}")
 
 
 @showing("data", "clip", "quality", "foreground", "workers", "cache_dir")

@@ -88,3 +88,9 @@ _KNOWN_WARNINGS = (
 def some(names: Sequence[str], shown: int = 10) -> str:
     """Join the first few names for a message."""
     return printable(", ".join(names[:shown])).replace("\n", "\\n") + (", …" if len(names) > shown else "")
+
+
+def gigabytes(size: float) -> str:
+    """Format a size in bytes in a suitable unit, kB to GB."""
+    unit, name = next(((u, n) for u, n in ((1e9, "GB"), (1e6, "MB")) if size >= u), (1e3, "kB"))
+    return f"{size / unit:.2f} {name}"

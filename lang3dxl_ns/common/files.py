@@ -9,12 +9,13 @@ import math
 import os
 import re
 import secrets
+import shutil
 import stat
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from lang3dxl_ns.common.console import say
+from lang3dxl_ns.common.console import gigabytes, say
 from lang3dxl_ns.common.errors import UserError, readable
 
 _MOST_BYTES = 64 << 20
@@ -113,6 +114,24 @@ def replace_file(path: Path, content: str | bytes) -> None:
         raise
 
 
+def own(path: Path) -> Path:
+    """Return a path of ours at which we write or delete. Raises UserError for a link or pipe: who made the
+    folder would choose which files that concerns."""
+    if path.is_symlink() or path.is_fifo():
+        raise UserError(f"{path} is a link or pipe, perhaps to files of others: remove it")
+    return path
+
+
+def own_folder(folder: Path, skipped: str = "") -> Path:
+    """Return a folder of ours in which we write or delete. Raises UserError as `own` does, for all that is in
+    it but what folders called `skipped` hold."""
+    for parent, folders, files in os.walk(own(folder)):
+        for name in (*folders, *files):
+            own(Path(parent, name))
+        folders[:] = [name for name in folders if name != skipped]
+    return folder
+
+
 def set_aside(path: Path) -> Path:
     """Rename a file that is not ours to overwrite to NAME.old, or NAME.old2 …, and return the new name."""
     path = path.resolve()
@@ -170,6 +189,15 @@ def make_folder(folder: Path) -> None:
     except OSError as error:
         error.filename = str(folder)
         raise
+
+
+def check_room(folder: Path, needed: float, what: str, remedy: str) -> int:
+    """Return a disk's free bytes. Raises UserError if what will be written to the folder needs more."""
+    free = shutil.disk_usage(folder).free
+    if needed > free:
+        room = f"{gigabytes(needed)} in {folder}, and {gigabytes(free)} are free"
+        raise UserError(f"{what} need {room}: free some space, or {remedy}")
+    return free
 
 
 def expanded(path: str | Path) -> Path:

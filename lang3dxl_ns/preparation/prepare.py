@@ -6,7 +6,6 @@ were made with other settings, so an interrupted run can simply be repeated.
 
 from __future__ import annotations
 
-import shutil
 import time
 from collections import deque
 from collections.abc import Callable, Collection, Sequence
@@ -17,8 +16,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lang3dxl_ns.common.console import say, some, tracked
+from lang3dxl_ns.common.console import gigabytes, say, some, tracked
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.files import check_room
 from lang3dxl_ns.common.options import data_option
 from lang3dxl_ns.common.stages import roughly
 from lang3dxl_ns.preparation import workers
@@ -195,13 +195,8 @@ class _Maker:
         needed = _BYTES * sum(target.numbers(networks) for target in targets)
         crop_size = networks.clip.crop_size if {CLIP, FINE} & self._kinds else 0
         store.make_folder()
-        free = shutil.disk_usage(store.root).free
-        if needed > free:
-            raise UserError(
-                f"the targets of {len(tasks)} photos need {_gigabytes(needed)} in {store.root}, and "
-                f"{_gigabytes(free)} are free: free some space, or use a larger smallest crop "
-                f"(scale range) or fewer dense tokens"
-            )
+        remedy = "use a larger smallest crop (scale range) or fewer dense tokens"
+        free = check_room(store.root, needed, f"the targets of {len(tasks)} photos", remedy)
         # A process holds the largest photo in float32 three times (as read, padded, in windows), and a batch
         # of crops with the first layers' activations, which take a dozen times its size.
         largest = max(task.photo.width * task.photo.height for task in tasks)
@@ -215,8 +210,8 @@ class _Maker:
             )
         say(
             f"preparing {len(tasks)} photos ({photos - len(tasks)} of {photos} are ready): "
-            f"{_gigabytes(needed)} in {store.root}, {_gigabytes(free)} are free",
-            f"memory beside the encoders: about {_gigabytes(memory)}{split}, however many photos there are",
+            f"{gigabytes(needed)} in {store.root}, {gigabytes(free)} are free",
+            f"memory beside the encoders: about {gigabytes(memory)}{split}, however many photos there are",
         )
         if crop_size:
             self._announce_duration(networks, torch.device(device), targets)
@@ -261,9 +256,3 @@ def _seconds_each(work: Callable[[int], Tensor], most: int) -> float:
         if size == most or taken > _MEASURED_S:
             return seconds / size
         size = min(4 * size, most)
-
-
-def _gigabytes(size: int) -> str:
-    """Format a size in bytes in a suitable unit, kB to GB."""
-    unit, name = next(((u, n) for u, n in ((1e9, "GB"), (1e6, "MB")) if size >= u), (1e3, "kB"))
-    return f"{size / unit:.2f} {name}"

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from lang3dxl_ns.common.console import tracked
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.common.files import read_json, replace_file
+from lang3dxl_ns.common.files import own, read_json, replace_file
 from lang3dxl_ns.common.options import data_option
 from lang3dxl_ns.scene.photo import Photo
 
@@ -68,8 +68,7 @@ class FeatureStore:
 
     def write_bytes(self, path: Path, content: bytes, what: str) -> None:
         """Write a file of the store atomically. Raises UserError if the disk is full or read-only."""
-        if path.parent.is_symlink():
-            raise UserError(f"{path.parent} is a link, perhaps into another scene's targets: remove it")
+        own(path.parent)
         with self._writable(what):
             replace_file(path, content)
 

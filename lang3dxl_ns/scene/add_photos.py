@@ -12,7 +12,6 @@ import os
 import shutil
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
@@ -26,20 +25,22 @@ from scipy.sparse import csr_array, triu
 from scipy.spatial import KDTree
 
 from lang3dxl_ns.common.console import say
-from lang3dxl_ns.common.errors import DAMAGE, UserError
-from lang3dxl_ns.common.files import expanded, locked, make_folder, read_json, replace_file
+from lang3dxl_ns.common.errors import UserError, readable
+from lang3dxl_ns.common.files import expanded, locked, replace_file
 from lang3dxl_ns.scene.colmap import load_pycolmap, read_reconstruction
-from lang3dxl_ns.scene.companions import cache_folder, inside
+from lang3dxl_ns.scene.colmap_files import PARTS
+from lang3dxl_ns.scene.companions import inside, work_folder
 from lang3dxl_ns.scene.layout import find_model, has_model, images_folder
 from lang3dxl_ns.scene.matching import extract, feature_database, match, numbered, quiet, usable
 from lang3dxl_ns.scene.photo_folder import PhotoFolder, find_photos, shared_cameras
 from lang3dxl_ns.scene.placements import LEAST_MATCHES, SOUND, doubtful_placements, matched_pairs
-from lang3dxl_ns.scene.reconstruct import check_settings, write_picture
+from lang3dxl_ns.scene.reconstruct import check_settings, writable, write_model, write_picture
 from lang3dxl_ns.scene.reconstruction import (
     REPORT,
     ReconstructionSettings,
-    doubtful_photos,
+    model_digest,
     picture_line,
+    read_report,
     reasons_in_words,
 )
 from lang3dxl_ns.scene.video import extract_frames, is_video
@@ -56,7 +57,7 @@ _ERROR = 0.005
 """Largest distance of a point from its pixel that agrees with a pose, relative to the longer side."""
 _TRUST = 1.1
 """How many times as many points must agree with a camera of its own as with one of the model's."""
-_PARTS = ("cameras", "images", "points3D", "rigs", "frames")
+_FILES = {part + end for part in (*PARTS, "rigs", "frames") for end in (".bin", ".txt")}
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,22 +91,24 @@ def add_photos(
         settings = replace(settings, features="sift")
     if settings.mapper != "incremental":
         raise UserError("--add places photos without a mapper: leave out --mapper")
-    data, folder = expanded(data).absolute(), expanded(folder).absolute()
+    data, folder = (Path(os.path.realpath(expanded(path))) for path in (data, folder))
     if is_video(folder):
         folder = extract_frames(folder)
-    cache = cache_folder(data, cache_dir).absolute()
-    work = cache / REPORT.parent
+    work = work_folder(data, cache_dir)
     place = find_model(data) or work / "sparse" / "0"
     images, old = _photos_of(data, place)
-    targets = _targets(folder, images, set(old))
     adding = work / "adding"
     with locked(adding, busy=f"another command adds photos in {adding}: wait for it, or end it"), quiet():
+        with readable(
+            f"{place} can't be added to", "export it in binary form, or reconstruct the photos anew"
+        ):
+            model = load_pycolmap().Reconstruction(place)
+        targets = _targets(folder, images, {image.name for image in model.images.values()})
         good, left_out = usable(PhotoFolder(images, (*old, *targets)))
         copies = numbered(good, adding)
         database = feature_database(good, copies, adding, settings, (work, work / "dsp-sift"))
         extract(database, copies, settings)
         number = dict(zip(good.names, copies.names, strict=True))
-        model = load_pycolmap().Reconstruction(place)
         new = {number[name] for name in targets if name in number}
         known = {(number[a], number[b]) for a, b in _pairs_of(model) if a in number and b in number}
         match(database, copies, settings, new, known)
@@ -121,16 +124,19 @@ def add_photos(
             _triangulate(model, db, numbers)
     found = {scene.names[i] for i in placed}
     lost = {targets[n]: left_out.get(n, "too few of its matches agree") for n in targets if n not in found}
-    told = reasons_in_words({"without a place": lost, "doubtfully placed": doubtful})
+    words = reasons_in_words({"without a place": lost, "doubtfully placed": doubtful})
     if not found:
-        raise UserError(f"none of the {len(targets)} new photos can be placed; {'; '.join(told)}")
+        raise UserError(f"none of the {len(targets)} new photos can be placed; {'; '.join(words)}")
     _copy(images, {name: target for name, target in targets.items() if name in found})
     for image in numbers.values():
         model.extract_colors_for_image(image, images)  # only of points without a color
+    told = read_report(work.parent, place)
     kept = _replace(place, model, work)
-    write_picture(model, doubtful | doubtful_photos(cache), work)
-    _report(work / REPORT.name, model, lost, doubtful)
-    say(f"{len(found)} of {len(targets)} new photos have a pose; the model as it was is in {kept}", *told)
+    told["left_out"] |= lost
+    told["doubtful"] |= doubtful
+    write_picture(model, told["doubtful"], work)
+    _report(work / REPORT.name, told, model, place)
+    say(f"{len(found)} of {len(targets)} new photos have a pose; the model as it was is in {kept}", *words)
     say(picture_line(work))
     return place
 
@@ -140,13 +146,15 @@ def _photos_of(data: Path, place: Path) -> tuple[Path, list[str]]:
     missing, or can't be written."""
     if not has_model(place):
         raise UserError(f"{data} has no COLMAP model to add photos to: reconstruct its own photos first")
-    images = images_folder(data, place)
+    images = Path(os.path.realpath(images_folder(data, place)))
     old = [name for name in read_reconstruction(place).photos if inside(images, name).is_file()]
     if not old:
         raise UserError(f"none of the photos in the model {place} is in {images}: put them there")
-    for written in (images, place.parent):
+    for written in (images, place):
         if not os.access(written, os.W_OK):
             raise UserError(f"{written} can't be written to: copy the scene to where it can")
+    if place.is_relative_to(data):
+        inside(data, os.path.relpath(place, data))  # who made the scene would choose which model is replaced
     return images, old
 
 
@@ -170,8 +178,7 @@ def _copy(images: Path, targets: Mapping[str, str]) -> None:
     """Copy new photos beside the scene's, unless they are there."""
     for name, target in targets.items():
         if not (images / target).exists():
-            make_folder((images / target).parent)
-            shutil.copy2(images / name, images / target)
+            _copied(images / name, images / target)
 
 
 def _targets(folder: Path, images: Path, known: set[str]) -> dict[str, str]:
@@ -365,35 +372,38 @@ def _triangulate(
     pycolmap.ObservationManager(model, matches).filter_points3D(*SOUND, set(model.points3D) - known)
 
 
-def _report(
-    path: Path, model: pycolmap.Reconstruction, lost: dict[str, str], doubtful: dict[str, str]
-) -> None:
-    """Update the model's report, if it has one: doubtful photos are asked for there. `lost` are new photos
-    without a place, with reasons."""
+def _report(path: Path, told: dict[str, Any], model: pycolmap.Reconstruction, place: Path) -> None:
+    """Write the report on a model at its place: doubtful photos are asked for there. `told` is the one on the
+    model as it was, with the photos that are new."""
     placed = {image.name for image in model.images.values() if image.has_pose}
-    with suppress(*DAMAGE):
-        told = read_json(path)
-        told["left_out"] = {n: why for n, why in (told["left_out"] | lost).items() if n not in placed}
-        told["registered"], told["points"] = len(placed), model.num_points3D()
-        told["photos"] = len(placed) + len(told["left_out"])
-        told["doubtful"] |= doubtful
-        replace_file(path, json.dumps(told, indent=2))
+    left_out = {name: why for name, why in told["left_out"].items() if name not in placed}
+    counts = {"photos": len(placed | left_out.keys()), "registered": len(placed)}
+    counts["points"] = model.num_points3D()
+    told |= {**counts, "left_out": left_out, "model": model_digest(place)}
+    replace_file(path, json.dumps(told, indent=2))
 
 
 def _replace(place: Path, model: pycolmap.Reconstruction, work: Path) -> Path:
-    """Replace a model's files, in their format, and return the folder of its copy."""
+    """Replace a model's files, in their format, and return the folder of their copies. Whatever else is in
+    the model's folder, which may be the photos', stays."""
     forms = (work / f"before_adding_{number}" for number in range(1, 10_000))
     kept = next(form for form in forms if not form.exists())
-    with TemporaryDirectory(prefix=f".{place.name}.", dir=place.parent) as folder:
-        shutil.copytree(place, Path(folder) / "kept")
-        shutil.move(Path(folder) / "kept", kept)
-        complete = Path(folder) / "complete"
-        shutil.copytree(place, complete)
-        write = model.write_binary if (place / "images.bin").exists() else model.write_text
-        for part in _PARTS:
-            for ending in (".bin", ".txt"):
-                (complete / f"{part}{ending}").unlink(missing_ok=True)
-        write(complete)
-        place.rename(Path(folder) / "old")
-        complete.rename(place)
+    old = [path for path in sorted(place.iterdir()) if path.name in _FILES]
+    write = model.write_binary if (place / "images.bin").exists() else model.write_text
+    with writable(place), TemporaryDirectory(prefix=".adding.", dir=place) as folder:
+        new = Path(folder) / "new"
+        write_model(write, new)
+        for path in old:
+            _copied(path, kept / path.name)
+        for path in old:
+            if not (new / path.name).exists():
+                path.unlink()
+        for part in sorted(new.iterdir()):
+            os.replace(part, place / part.name)
     return kept
+
+
+def _copied(source: Path, target: Path) -> None:
+    """Copy a file with its times. An interruption leaves none, rather than a part of it."""
+    replace_file(target, source.read_bytes())
+    shutil.copystat(source, target)

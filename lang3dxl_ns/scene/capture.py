@@ -38,7 +38,7 @@ from lang3dxl_ns.scene.layout import (
 from lang3dxl_ns.scene.masks import mask_folder
 from lang3dxl_ns.scene.matching import shows_these
 from lang3dxl_ns.scene.names import listed, resolve
-from lang3dxl_ns.scene.photo import Photo, upright_in_model
+from lang3dxl_ns.scene.photo import Photo, stored_size, upright
 from lang3dxl_ns.scene.photo_folder import check_data, find_photos, photos_below
 from lang3dxl_ns.scene.reconstruct import reconstruct_scene
 from lang3dxl_ns.scene.reconstruction import CONTRADICTED, doubtful_photos, reasons_in_words
@@ -213,7 +213,7 @@ def open_capture(
         capture = _of_transforms(source, settings)
     else:
         capture = _of_model(folder, source, settings)
-        doubts = doubtful_photos(cache_folder(folder, cache_dir))
+        doubts = doubtful_photos(cache_folder(folder, cache_dir), source)
         capture = replace(capture, doubtful={n: doubts[n] for n in capture.names if n in doubts})
     if not capture.photos:
         first = next(iter(capture.left_out.items()), ("", "it lists none"))
@@ -249,7 +249,9 @@ def find_source(
         return whole, folder if has_model(folder) else find_model(whole) or folder
     if (source := _source_in(folder, cache_dir)) is not None:
         return folder, source
-    if may_reconstruct and find_photos(folder).names:
+    if may_reconstruct and (photos := find_photos(folder)).names:
+        for name in photos.names:  # training would refuse them after hours
+            inside(photos.folder, name, settings.follow_links)
         mention_other_cameras(folder)
         return reconstruct_scene(folder, cache_dir)
     of_models = (path for part in ("images", "cameras") for path in folder.rglob(f"{part}.[bt]*"))
@@ -311,7 +313,7 @@ def _usable(
                 raise doubts[name]
             if not inside(images, file, links).is_file():
                 raise UserError(f"there is no {path}")
-            turned = replace(upright_in_model(tracked, path), name=file)
+            turned = replace(upright(tracked, *stored_size(path, name)), name=file)
             mask = (masks_of or {}).get(name)
             if mask is None and masks is not None:
                 mask = masks.find(file)

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path, PurePosixPath
 
 from lang3dxl_ns.common.errors import UserError, is_plain
-from lang3dxl_ns.common.files import expanded
-from lang3dxl_ns.common.options import data_option
+from lang3dxl_ns.common.files import expanded, own_folder
+from lang3dxl_ns.common.options import capture_option, data_option, switched_on
+from lang3dxl_ns.scene.reconstruction import REPORT
 
 _LONGEST_NAME = 255
 """Longest file name that file systems allow, in bytes."""
@@ -26,9 +27,10 @@ def inside(folder: Path, name: str, follow_links: bool = False) -> Path:
         raise UserError(f"{name:.40}… is too long for a file's name: {_LONGEST_NAME} bytes at most")
     target = Path(os.path.realpath(path))  # unlike resolve(), accepts links in a circle
     if not follow_links and not target.is_relative_to(os.path.realpath(folder)):
+        followed = switched_on(capture_option("follow-links"))
         raise UserError(
-            f"{path} is a link that leads out of {folder}, to {target}: copy the file there; "
-            "ns-train follows links with `lang3dxl-colmap --follow-links True` after all other options"
+            f"{path} is a link that leads out of {folder}, to {target}: copy it there; training follows "
+            f"links with {followed}"
         )
     return path
 
@@ -62,13 +64,15 @@ def companion(folder: Path, name: str, suffixes: Sequence[str], follow_links: bo
     return None if found is None else inside(folder, str(found.relative_to(folder)), follow_links)
 
 
-def named_folder(choice: str, data: Path, option: str) -> Path:
+def named_folder(
+    choice: str | Path, data: Path, option: str, spell: Callable[[str], str] = data_option
+) -> Path:
     """Return the folder given to an option, relative to `data`. Raises UserError if it does not exist."""
     folder = data / expanded(choice)
     if not folder.is_dir():
         raise UserError(
-            f"{data_option(option)} {choice}: there is no folder {folder}; give an existing one "
-            "(relative to the data folder, or absolute), or one of the choices listed by --help"
+            f"{spell(option)} {choice}: there is no folder {folder}; give an existing one "
+            "(relative to the data folder, or absolute), or what --help lists"
         )
     return folder
 
@@ -83,3 +87,9 @@ def cache_folder(data: Path, named: Path | None) -> Path:
         instead = f"{data_option('cache-dir')} {os.path.realpath(folder)}"
         raise UserError(f"{folder} is a link: remove it, or if it is yours, add {instead}")
     return folder
+
+
+def work_folder(data: Path, named: Path | None) -> Path:
+    """Return the folder of a reconstruction's features, matches and report in the cache. Raises UserError as
+    `cache_folder` does, also for links in it but those to the photos, which are made anew."""
+    return own_folder(cache_folder(data, named).absolute() / REPORT.parent, "numbered")

@@ -10,7 +10,9 @@ from pathlib import Path
 from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import DAMAGE
 from lang3dxl_ns.common.files import read_text
+from lang3dxl_ns.common.options import capture_option
 from lang3dxl_ns.scene.colmap import photos_in_model
+from lang3dxl_ns.scene.companions import named_folder
 from lang3dxl_ns.scene.photo_folder import find_photos, photos_below
 
 MODEL_FOLDERS = (
@@ -18,6 +20,7 @@ MODEL_FOLDERS = (
     *(Path("colmap"), Path(".")),
 )
 """Usual places of a model, the first of which counts. Elsewhere, the model with the most photos does."""
+_IMAGES = Path("images")
 _SMALLER = tuple(Path(f"images_{factor}") for factor in (2, 4, 8))
 """Copies of the photos at lower resolutions, which are used if there are no others."""
 _DEPTH = 3
@@ -73,10 +76,13 @@ def _models_below(folder: Path) -> Iterator[Path]:
             yield here
 
 
-def images_folder(data: Path, model: Path, named: Path = Path("images")) -> Path:
-    """Return the folder of a model's photos: `named` in the scene's if it has photos, else images/ nearest
-    above the model, else wherever there are photos."""
-    above = [parent / "images" for parent in model.parents if parent.is_relative_to(data)]
+def images_folder(data: Path, model: Path, named: Path = _IMAGES) -> Path:
+    """Return the folder of a model's photos: `named` in the scene's or, where that is the usual one and has
+    no photos, images/ nearest above the model, else wherever there are photos. Raises UserError if the named
+    one does not exist."""
+    if named != _IMAGES:
+        return named_folder(named, data, "images-path", capture_option)
+    above = [parent / named for parent in model.parents if parent.is_relative_to(data)]
     for folder in (data / named, *above):
         if any(photos_below(folder)):
             return folder

@@ -32,6 +32,7 @@ LEAST_ALIKE = 20
 """Possible matches from which a pair of photos is matched."""
 PARTNERS, NEIGHBORS = 12, 40
 """Photos that each photo is matched with at least, those with the most possible matches, and at most."""
+_COMPARED = 1_000  # features of a photo by which its partners are chosen
 KEPT = "xfeat"
 """Folder of descriptors, beside the database."""
 _MULTIPLE = 32
@@ -137,15 +138,13 @@ class LearnedMatcher:
                     db.write_matches(*ids, matches.numpy().astype(np.uint32))
 
 
-def alike_pairs(
-    photos: Mapping[str, Features], neighbors: int = NEIGHBORS, sample: int = 1_000
-) -> list[tuple[str, str]]:
-    """Choose the pairs of photos that may overlap, by mutual nearest descriptors among their `sample` best
-    features. Every photo gets its `PARTNERS` most alike, and others with at least `LEAST_ALIKE` possible
-    matches, up to `neighbors`."""
+def alike_pairs(photos: Mapping[str, Features]) -> list[tuple[str, str]]:
+    """Choose the pairs of photos that may overlap, by mutual nearest descriptors among their best features.
+    Every photo gets its `PARTNERS` most alike, and others with at least `LEAST_ALIKE` possible matches, up to
+    `NEIGHBORS`."""
     names = list(photos)
     counts = np.zeros((len(names), len(names)), dtype=int)
-    best = [photos[name].descriptors[:sample] for name in names]
+    best = [photos[name].descriptors[:_COMPARED] for name in names]
     with progress("photos compared", len(names)) as advance:
         for i in range(len(names)):
             for j in range(i):
@@ -154,7 +153,7 @@ def alike_pairs(
     order = np.argsort(-counts, axis=1, kind="stable")
     chosen = set()
     for i in range(len(names)):
-        for place, j in enumerate(order[i][: min(neighbors, len(names) - 1)].tolist()):
+        for place, j in enumerate(order[i][: min(NEIGHBORS, len(names) - 1)].tolist()):
             if i != j and (place < PARTNERS or counts[i, j] >= LEAST_ALIKE):
                 chosen.add((names[min(i, j)], names[max(i, j)]))
     return sorted(chosen)

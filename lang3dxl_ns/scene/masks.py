@@ -7,8 +7,9 @@ from functools import cached_property
 from pathlib import Path
 
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.options import capture_option
 from lang3dxl_ns.common.pictures import PHOTO_SUFFIXES
-from lang3dxl_ns.scene.companions import inside
+from lang3dxl_ns.scene.companions import inside, named_folder
 from lang3dxl_ns.scene.names import normal_parts
 
 FOLDERS = (Path("masks"), Path("mask"))
@@ -93,9 +94,11 @@ def mask_folder(
 ) -> MaskFolder | None:
     """Return the folder of masks: `named` (relative to `data`), or where that is the usual one, a usual one
     of the scene or of the photos (`images`), or the photos' folder if masks lie in it; None if there is
-    none."""
+    none. Raises UserError if the named one does not exist."""
+    if named is None:
+        return None
     if named not in FOLDERS:
-        return MaskFolder(data / named, follow_links) if named and (data / named).is_dir() else None
+        return MaskFolder(named_folder(named, data, "masks-path", capture_option), follow_links)
     images = images or data
     for folder in dict.fromkeys((data, images.parent, images)):
         for path in sorted(folder.iterdir()) if folder.is_dir() else []:

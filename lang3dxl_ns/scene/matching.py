@@ -21,10 +21,11 @@ import numpy as np
 from jaxtyping import UInt8
 from numpy import ndarray as Array
 
-from lang3dxl_ns.common.console import progress, say
-from lang3dxl_ns.common.errors import DAMAGE, is_plain
-from lang3dxl_ns.common.files import read_json, replace_file
+from lang3dxl_ns.common.console import progress, say, some
+from lang3dxl_ns.common.errors import DAMAGE, UserError, is_plain
+from lang3dxl_ns.common.files import check_room, read_json, replace_file
 from lang3dxl_ns.common.memory import machine_memory
+from lang3dxl_ns.common.options import data_option
 from lang3dxl_ns.common.pictures import open_picture
 from lang3dxl_ns.scene.colmap import load_pycolmap
 from lang3dxl_ns.scene.learned_features import LearnedMatcher, extract_learned
@@ -40,6 +41,8 @@ _MEMORY_PER_THREAD = 1e9  # bytes that SIFT takes on a photo of 1600 pixels, the
 _ENDINGS = {"JPEG": ".jpg", "MPO": ".jpg", "PNG": ".png", "TIFF": ".tif", "BMP": ".bmp"}
 """Formats that COLMAP reads; others become JPEGs of this quality."""
 _QUALITY = 98
+_BYTES_PER_FEATURE = 170  # in the database, with its part of the matches
+_MOST_EXIF = 65_533  # bytes that a JPEG holds
 _CHUNK_PHOTOS, _CHUNK_PAIRS, _CHUNK_LEARNED = 8, 100, 5  # a step of the bar, which a killed process loses
 _STAMP = "photos.json"
 _TABLES = {"keypoints": 4, "descriptors": 1, "matches": 4, "two_view_geometries": 4}
@@ -74,6 +77,7 @@ def numbered(photos: PhotoFolder, work: Path) -> PhotoFolder:
             number = f"{index:06d}{_ENDINGS.get(image.format or '', '.jpg')}"
             if foreign:  # COLMAP reads the focal length from EXIF
                 exif = image.info.get("exif", b"")
+                exif = exif if len(exif) <= _MOST_EXIF else b""
                 image.convert("RGB").save(folder / number, quality=_QUALITY, subsampling=0, exif=exif)
         if not foreign:
             try:
@@ -114,6 +118,12 @@ def feature_database(
     for group in groups:
         numbers = [number[name] for name in group]
         pycolmap.import_images(importing, copies.folder, pycolmap.CameraMode.SINGLE, numbers)
+    if settings.one_camera:  # COLMAP passes over photos of another size, and later gives each its own
+        with pycolmap.Database.open(importing) as db:
+            odd = [name for name in photos.names if not db.exists_image(number[name])]
+        if odd:
+            several = f"{some(odd)} can't share the camera of {photos.names[0]}, which has another size"
+            raise UserError(f"{several}: lang3dxl reconstruct without --one-camera, or without them")
     wanted = {content: name for *_, content, name in told}
     for folder in (work, *earlier):
         _keep_features(folder, importing, wanted, made)
@@ -165,6 +175,10 @@ def extract(database: Path, photos: PhotoFolder, settings: ReconstructionSetting
     with pycolmap.Database.open(database) as db:
         done = {image.name for image in db.read_all_images() if db.exists_keypoints(image.image_id)}
     missing = [name for name in photos.names if name not in done]
+    needed = _BYTES_PER_FEATURE * settings.max_features * len(missing)
+    check_room(
+        database.parent, needed, f"features of {len(missing)} photos", f"choose {data_option('cache-dir')}"
+    )
     if settings.features == "xfeat":
         return extract_learned(database, photos.folder, missing, settings.max_size, settings.max_features)
     options = pycolmap.FeatureExtractionOptions(
@@ -204,6 +218,7 @@ def match(
         ids = {image.name: image.image_id for image in db.read_all_images()}
         known = sorted(n for n in photos.names if n in ids and db.num_keypoints_for_image(ids[n]))
         new.intersection_update(known)
+        matched = {pair for pair in matched if not {*pair}.difference(known)}
         learned = LearnedMatcher(database, known) if settings.features == "xfeat" else None
         if learned:
             pairs = learned.pairs()
@@ -309,5 +324,6 @@ def shows_these(work: Path, data: Path) -> bool:
     except DAMAGE:
         return True
     photos = find_photos(data)
-    here = {(name, (photos.folder / name).stat().st_size) for name in photos.names}
+    there = {name: photos.folder / name for name in photos.names}
+    here = {(name, path.stat().st_size) for name, path in there.items() if path.is_file()}
     return 2 * len(recorded & here) > len(recorded)

@@ -5,11 +5,12 @@ from __future__ import annotations
 import unicodedata
 from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterable, Sequence
-from pathlib import PurePosixPath
+from pathlib import Path
 
 from lang3dxl_ns.common.checks import expect
 from lang3dxl_ns.common.console import say, some
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.pictures import unreadable
 
 _Parts = tuple[str, ...]
 
@@ -35,20 +36,16 @@ def name_finder(files: Iterable[str]) -> Callable[[str], list[str]]:
     for file in files:
         last = normal_parts(file)[-1]
         by_name[last].append(file)
-        by_stem[_stem(last)].append(file)
+        by_stem[Path(last).stem].append(file)
 
     def find(name: str) -> list[str]:
         if not (parts := normal_parts(name)):
             return []
         *folders, last = parts
-        fitting = by_name.get(last) or by_stem.get(last) or by_stem.get(_stem(last), [])
+        fitting = by_name.get(last) or by_stem.get(last) or by_stem.get(Path(last).stem, [])
         return _deepest(tuple(folders), fitting)
 
     return find
-
-
-def _stem(name: str) -> str:
-    return PurePosixPath(name).stem
 
 
 def _deepest(folders: _Parts, files: Sequence[str]) -> list[str]:
@@ -88,6 +85,7 @@ def resolve(
     guessed = dict[str, str]()
     for name in others:
         fitting = find(name)
+        fitting = [file for file in fitting if not unreadable(Path(file))] or fitting
         if fitting == [name]:
             continue  # it is something else than a file
         if len(fitting) == 1:

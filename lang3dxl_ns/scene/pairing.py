@@ -36,7 +36,7 @@ def pairs_to_match(
     ones, and neighbors in the order of names, as of a video, and of each walk."""
     if len(names) <= EXHAUSTIVE:
         return list(combinations(names, 2))
-    found = set(similar_pairs(names, descriptors, ALIKE, new))
+    found = set(similar_pairs(names, descriptors, new))
     for walk in (names, *walks):
         for apart in (1, 2, 4, 8):
             found.update((min(pair), max(pair)) for pair in zip(walk[:-apart], walk[apart:], strict=True))
@@ -44,9 +44,9 @@ def pairs_to_match(
 
 
 def similar_pairs(
-    names: Sequence[str], descriptors: Descriptors, neighbors: int, new: Collection[str]
+    names: Sequence[str], descriptors: Descriptors, new: Collection[str]
 ) -> list[tuple[str, str]]:
-    """Pair each new photo with the `neighbors` photos in which most of its largest features have a match
+    """Pair each new photo with the `ALIKE` photos in which most of its largest features have a match
     (preemptive matching, Wu 2013)."""
     names = sorted(names, key=lambda name: name not in new)  # the new ones first
     rows = torch.stack([_rows(descriptors(name)) for name in names])
@@ -56,7 +56,7 @@ def similar_pairs(
             counts[i, i + 1 :] = _possible_matches(rows[i], rows[i + 1 :])
             counts[i + 1 :, i] = counts[i, i + 1 : len(new)]
             advance(1)
-    return _best_pairs(names, counts, neighbors)
+    return _best_pairs(names, counts, ALIKE)
 
 
 def pairs_that_share(

@@ -52,7 +52,7 @@ class Photo(HasLens):
 
     @classmethod
     def from_model(cls, tracked: TrackedPhoto, path: Path, mask_path: Path | None = None) -> Photo:
-        """Create a photo from the model (after `upright_in_model`), with its lens at the size of the file on
+        """Create a photo from the model (after `upright`), with its lens at the size of the file on
         disk, so that resized photos work. Without a mask, a photo with transparent parts is its own. Raises
         UserError for an unreadable file, another aspect ratio, and a lens that no photo can have."""
         with _readable(path, tracked.name), open_picture(path) as image:
@@ -216,11 +216,6 @@ def stored_size(path: Path, name: str) -> tuple[tuple[int, int], int]:
     Raises UserError for an unreadable file."""
     with _readable(path, name), open_picture(path) as image:
         return image.size, quarter_turns(image)
-
-
-def upright_in_model(tracked: TrackedPhoto, path: Path) -> TrackedPhoto:
-    """Turn a model's photo upright with its file. Raises UserError for an unreadable file."""
-    return upright(tracked, *stored_size(path, tracked.name))
 
 
 @contextmanager

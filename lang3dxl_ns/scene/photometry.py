@@ -17,6 +17,8 @@ _SIDE = 512  # longer side in pixels at which colors are read, so that a pixel a
 _DARK, _BRIGHT = 0.03, 0.97  # beyond these, sensors do not record brightness faithfully
 _GAMMA = 2.2
 _FEWEST_POINTS = 20
+_MOST_PHOTOS = 60
+_FEWEST_VIEWS = 6  # of a point, for a linear function of direction and a remainder
 
 
 @dataclass(frozen=True)
@@ -30,13 +32,11 @@ class Photometry:
     chance. Highlights and sheen raise it."""
 
 
-def measure_photometry(
-    photos: Sequence[Photo], reconstruction: Reconstruction, at_most: int = 60
-) -> Photometry | None:
-    """Fit log color = point + photo (robust per photo) to at most `at_most` photos, evenly spaced. Unreadable
+def measure_photometry(photos: Sequence[Photo], reconstruction: Reconstruction) -> Photometry | None:
+    """Fit log color = point + photo (robust per photo) to at most 60 photos, evenly spaced. Unreadable
     photos are skipped. The result is None if fewer than three photos share enough tracked points."""
     rows: list[tuple[Array, ...]] = []
-    for photo in photos[:: max(-(-len(photos) // at_most), 1)]:
+    for photo in photos[:: max(-(-len(photos) // _MOST_PHOTOS), 1)]:
         tracked = reconstruction.photos.get(photo.name)
         if tracked is None or len(tracked.points) < _FEWEST_POINTS:
             continue
@@ -102,11 +102,11 @@ def _grouped(numbers: Int[Array, " m"]) -> list[Int[Array, " k"]]:
 
 
 def _explained_by_direction(
-    point: Int[Array, " m"], residual: Float[Array, "m 3"], ray: Float[Array, "m 3"], fewest: int = 6
+    point: Int[Array, " m"], residual: Float[Array, "m 3"], ray: Float[Array, "m 3"]
 ) -> float:
-    """Compute the adjusted R² of a linear function of direction, over points seen at least `fewest` times."""
+    """Compute the adjusted R² of a linear function of direction, over points seen often enough."""
     explained, total = 0.0, 0.0
-    for group in (group for group in _grouped(point) if len(group) >= fewest):
+    for group in (group for group in _grouped(point) if len(group) >= _FEWEST_VIEWS):
         centered = ray[group] - ray[group].mean(axis=0)
         gray = residual[group].mean(axis=1)
         gray = gray - gray.mean()

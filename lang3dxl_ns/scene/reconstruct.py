@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from importlib.util import find_spec
@@ -22,11 +23,11 @@ from lang3dxl_ns.common.checks import check_numbers
 from lang3dxl_ns.common.console import progress, say, tracked
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import expanded, locked, replace_file
-from lang3dxl_ns.common.options import data_option
 from lang3dxl_ns.common.reports import timed
 from lang3dxl_ns.scene.camera_picture import camera_picture
 from lang3dxl_ns.scene.colmap import load_pycolmap
-from lang3dxl_ns.scene.companions import cache_folder
+from lang3dxl_ns.scene.colmap_files import read_model_files
+from lang3dxl_ns.scene.companions import work_folder
 from lang3dxl_ns.scene.matching import (
     extract,
     feature_database,
@@ -51,6 +52,7 @@ from lang3dxl_ns.scene.reconstruction import (
     REPORT,
     ReconstructionReport,
     ReconstructionSettings,
+    model_digest,
     picture_line,
 )
 from lang3dxl_ns.scene.symmetry import contradictions, copy_without
@@ -81,7 +83,7 @@ def reconstruct(
     largest model is written to `model`/0, others to `model`/1 …. Raises UserError that says what to do for
     fewer than three photos, if `model` already exists, and if the photos do not make a scene."""
     settings = settings or ReconstructionSettings()
-    if model.exists() and (model_in(model) or any(model.iterdir())):
+    if model.exists() and any(model.iterdir()):
         raise UserError(f"{model} already exists and is left alone; remove it to reconstruct the photos anew")
     _check_enough(photos, photos, {})
     say(f"{len(photos.names)} photos in {photos.folder}, without a COLMAP model: reconstructing")
@@ -113,7 +115,8 @@ def reconstruct(
     )  # fmt: skip
     _publish(models, model)
     write_picture(best, doubtful, work)
-    replace_file(work / REPORT.name, json.dumps(asdict(report), indent=2))
+    told = asdict(report) | {"model": model_digest(model / "0")}
+    replace_file(work / REPORT.name, json.dumps(told, indent=2))
     return report
 
 
@@ -193,7 +196,7 @@ def reconstruct_scene(
     if is_video(data):
         data = extract_frames(data)
     photos = find_photos(data)
-    work = cache_folder(data, cache_dir).absolute() / REPORT.parent
+    work = work_folder(data, cache_dir)
     model = data / "sparse"
     if not os.access(data, os.W_OK) or (model.exists() and not model_in(model)):
         model = work / "sparse"
@@ -311,16 +314,28 @@ def _map_without(
 
 def _publish(models: list[pycolmap.Reconstruction], model: Path) -> None:
     """Write all models, and move them into place at once."""
+    with writable(model), TemporaryDirectory(prefix=f".{model.name}.", dir=model.parent) as folder:
+        complete = Path(folder) / "complete"
+        for index, found in enumerate(models):
+            write_model(found.write_binary, complete / str(index))
+        complete.rename(model)
+
+
+@contextmanager
+def writable(model: Path) -> Iterator[None]:
+    """Turn errors of writing a model into a UserError."""
     try:
-        with TemporaryDirectory(prefix=f".{model.name}.", dir=model.parent) as folder:
-            complete = Path(folder) / "complete"
-            for index, found in enumerate(models):
-                (complete / str(index)).mkdir(parents=True)
-                found.write_binary(complete / str(index))
-            complete.rename(model)
-    except OSError as error:
+        yield
+    except (OSError, RuntimeError, ValueError, UserError) as error:
         trouble = f"the model can't be written to {model} ({error})"
-        raise UserError(f"{trouble}: make room, or choose {data_option('cache-dir')}") from error
+        raise UserError(f"{trouble}: make room, and run the same command again") from error
+
+
+def write_model(write: Callable[[Path], None], folder: Path) -> None:
+    """Write a model to a new folder, and read it again: COLMAP doesn't notice a full disk."""
+    folder.mkdir(parents=True)
+    write(folder)
+    read_model_files(folder)
 
 
 def write_picture(model: pycolmap.Reconstruction, doubtful: Collection[str], work: Path) -> None:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from lang3dxl_ns.common.console import some
 from lang3dxl_ns.common.errors import DAMAGE
@@ -17,6 +18,8 @@ REPORT = Path("reconstruction/report.json")
 PICTURE = REPORT.with_name("cameras.png")
 """File beside the report that shows cameras and points."""
 
+_REASONS = ("left_out", "doubtful")
+"""Parts of the report: photos with reasons."""
 CONTRADICTED, LONELY = (
     "most of its matches are with photos placed elsewhere",
     "only one other photo supports it",
@@ -109,8 +112,26 @@ def picture_line(work: Path) -> str:
     return f"cameras and points from above and from the side: {work / PICTURE.name}"
 
 
-def doubtful_photos(cache_dir: Path) -> dict[str, str]:
-    """Read from a scene's cache which photos were doubtfully placed, with reasons; none without a report."""
+def read_report(cache_dir: Path, model: Path) -> dict[str, Any]:
+    """Read the report on a model from a cache, with photos `left_out` and `doubtful`: none without a report,
+    or in another model's, since caches may be another scene's. Reports of earlier versions name no model."""
     with suppress(*DAMAGE):
-        return {str(name): str(why) for name, why in read_json(cache_dir / REPORT)["doubtful"].items()}
-    return {}
+        told = read_json(cache_dir / REPORT)
+        reasons = {
+            part: {str(name): str(why) for name, why in told.get(part, {}).items()} for part in _REASONS
+        }
+        if "model" not in told or told["model"] == model_digest(model):
+            return told | reasons
+    return {part: {} for part in _REASONS}
+
+
+def doubtful_photos(cache_dir: Path, model: Path) -> dict[str, str]:
+    """Read from a cache which photos of a model were doubtfully placed, with reasons."""
+    return read_report(cache_dir, model)["doubtful"]
+
+
+def model_digest(model: Path) -> str:
+    """Compute a digest of the photos of a model, with their poses and keypoints. Raises OSError without."""
+    path = model / "images.bin"
+    content = (path if path.is_file() else path.with_suffix(".txt")).read_bytes()
+    return hashlib.blake2b(content, digest_size=16).hexdigest()

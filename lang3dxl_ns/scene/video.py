@@ -7,6 +7,7 @@ import shutil
 import subprocess
 from contextlib import suppress
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,8 @@ from scipy import ndimage
 
 from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import DAMAGE, UserError
-from lang3dxl_ns.common.files import read_json, replace_file
+from lang3dxl_ns.common.files import locked, own, read_json, replace_file
+from lang3dxl_ns.scene.companions import cache_folder
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mts")
 FRAMES_PER_SECOND = 2.0
@@ -37,6 +39,11 @@ def _reading(program: str, video: Path) -> list[str]:
     return [program, *_READING, "-i", f"file:{video.absolute()}"]
 
 
+def _each(filters: str) -> list[str]:
+    """Return options of ffmpeg that write each frame that the filters leave once. (-fps_mode came in 5.1.)"""
+    return ["-an", "-vf", f"{filters},settb=1/25,setpts=N", "-r", "25"]
+
+
 def is_video(path: Path) -> bool:
     """Return whether this is a file that ffmpeg may be able to read as a video."""
     return path.is_file() and path.suffix.lower() in VIDEO_SUFFIXES
@@ -52,7 +59,7 @@ def extract_frames(video: Path, rate: float = FRAMES_PER_SECOND, most: int = MOS
     unless an earlier call did. Raises UserError without ffmpeg, for a file that is no video or a very short
     one, and for a folder with the frames of another video."""
     folder = frames_folder(video)
-    made_of = folder / "lang3dxl_cache" / "video.json"
+    made_of = cache_folder(folder, None) / "video.json"
     this = known = [video.name, video.stat().st_size] if video.is_file() else None
     if (folder / "images").is_dir():
         with suppress(*DAMAGE):  # frames of an earlier version have no such file
@@ -68,11 +75,13 @@ def extract_frames(video: Path, rate: float = FRAMES_PER_SECOND, most: int = MOS
     duration = _duration(video)
     stretches = max(1, min(most, int(duration * rate + 0.01)))  # times are rounded
     say(f"{video.name}: {duration:.0f} s, the sharpest frame of each of {stretches} intervals")
-    sharpness, change = _looks(video)
-    if len(sharpness) < 3:
-        raise UserError(f"{video} has {len(sharpness)} frames, too few: record several seconds while moving")
-    _write(video, folder, _sharpest(sharpness, change, min(stretches, len(sharpness))))
-    replace_file(made_of, json.dumps(this))
+    with locked(folder, busy=f"another command writes frames into {folder}: wait for it, or end it"):
+        sharpness, change = _looks(video)
+        if len(sharpness) < 3:
+            few = f"{len(sharpness)} frames, too few"
+            raise UserError(f"{video} has {few}: record several seconds while moving")
+        _write(video, folder, _sharpest(sharpness, change, min(stretches, len(sharpness))))
+        replace_file(made_of, json.dumps(this))
     return folder
 
 
@@ -91,10 +100,13 @@ def _looks(video: Path) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
     """Compute, for every frame, downsized and gray, the variance of its Laplacian and its difference from the
     frame before, which is coarse so that noise is none."""
     width, height = _LOOK
-    command = [*_reading("ffmpeg", video), "-an", "-vf", f"scale={width}:{height}"]
-    command += ["-fps_mode", "passthrough", "-f", "rawvideo", "-pix_fmt", "gray", "-"]
+    command = [*_reading("ffmpeg", video), *_each(f"scale={width}:{height}")]
+    command += ["-f", "rawvideo", "-pix_fmt", "gray", "-"]
     values, changes, before = [], [], None
-    with subprocess.Popen(command, stdin=_SILENT, stdout=subprocess.PIPE, stderr=_SILENT) as process:
+    with (
+        TemporaryFile() as errors,
+        subprocess.Popen(command, stdin=_SILENT, stdout=subprocess.PIPE, stderr=errors) as process,
+    ):
         assert process.stdout is not None
         while len(frame := process.stdout.read(width * height)) == width * height:
             gray = np.frombuffer(frame, np.uint8).reshape(height, width).astype(np.float32)
@@ -102,6 +114,10 @@ def _looks(video: Path) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
             coarse = gray.reshape(height // _COARSE, _COARSE, width // _COARSE, _COARSE).mean((1, 3))
             changes.append(0.0 if before is None else float(np.abs(coarse - before).mean()))
             before = coarse
+        if process.wait():
+            errors.seek(0)
+            said = " ".join(errors.read().decode(errors="replace").split())[-200:]
+            raise UserError(f"ffmpeg can't read {video} ({said}): copy it again, or convert it")
     return np.array(values), np.array(changes)
 
 
@@ -134,12 +150,12 @@ def _probed(video: Path, entries: str) -> dict[str, Any]:
 
 def _write(video: Path, folder: Path, chosen: Int[Array, " s"]) -> None:
     """Write the chosen frames as JPEGs, all at once, so that a partial folder never looks complete."""
-    partial = folder / ".images.partial"
+    partial = own(folder / ".images.partial")
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)
     wanted = "+".join(f"eq(n,{index})" for index in chosen)
-    command = [*_reading("ffmpeg", video), "-an", "-vf", f"select='{wanted}'"]
-    command += ["-fps_mode", "passthrough", "-q:v", "2", str(partial).replace("%", "%%") + "/frame_%05d.jpg"]
+    command = [*_reading("ffmpeg", video), *_each(f"select='{wanted}'")]
+    command += ["-q:v", "2", str(partial).replace("%", "%%") + "/frame_%05d.jpg"]
     done = subprocess.run(command, stdin=_SILENT, capture_output=True, text=True, check=False)
     if done.returncode or not any(partial.iterdir()):
         said = " ".join(done.stderr.split())[-200:]

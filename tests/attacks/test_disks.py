@@ -14,11 +14,11 @@ import torch
 
 from lang3dxl_ns.cli import main
 from lang3dxl_ns.common import files
+from lang3dxl_ns.common.console import gigabytes
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.open_scene import load_scene
 from lang3dxl_ns.plugin.trainer import _disk_kept_out_of_training, writer
 from lang3dxl_ns.preparation import workers
-from lang3dxl_ns.preparation.prepare import _gigabytes
 from lang3dxl_ns.preparation.settings import PreparationConfig
 from lang3dxl_ns.preparation.store import FeatureStore
 
@@ -144,7 +144,7 @@ def test_a_store_that_can_be_none_is_one_line(place):
 
 
 def test_sizes_are_told_in_a_unit_that_shows_them():
-    assert [_gigabytes(x) for x in (1_500, 2_500_000, 3 * 10**9)] == ["1.50 kB", "2.50 MB", "3.00 GB"]
+    assert [gigabytes(x) for x in (1_500, 2_500_000, 3 * 10**9)] == ["1.50 kB", "2.50 MB", "3.00 GB"]
 
 
 # ── a cluster that never answers ────────────────────────────────────────────────────────────────────────

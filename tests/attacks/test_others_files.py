@@ -13,6 +13,7 @@ import torch
 from painted_scene import CHANNELS, encode_texts, painted_scene
 
 from lang3dxl_ns import load_scene, train
+from lang3dxl_ns.attachment.views import rendered_views
 from lang3dxl_ns.commands.teach import forgotten
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import file_locked, locked, replace_file, set_aside
@@ -21,9 +22,13 @@ from lang3dxl_ns.components.field_settings import SemanticFieldConfig
 from lang3dxl_ns.files.read_splats import read_splats
 from lang3dxl_ns.files.scene_file import Provenance, read_scene, replace_scene, write_scene
 from lang3dxl_ns.preparation.store import FeatureStore
+from lang3dxl_ns.scene import video
+from lang3dxl_ns.scene.add_photos import add_photos
 from lang3dxl_ns.scene.capture import open_capture
-from lang3dxl_ns.scene.companions import cache_folder
+from lang3dxl_ns.scene.companions import cache_folder, work_folder
+from lang3dxl_ns.scene.reconstruct import reconstruct_scene
 from lang3dxl_ns.scene.record import same_clip
+from lang3dxl_ns.scene.video import frames_folder
 from lang3dxl_ns.web.write_page import Page, write_page
 from lang3dxl_ns.words.taught_words import Example, TaughtWord, load_words, mask_of, save_words
 
@@ -91,6 +96,55 @@ def test_a_cache_that_came_as_a_link_is_refused_and_a_named_one_is_the_users(tmp
     linked = tmp_path / "data" / "lang3dxl_cache"
     assert cache_folder(tmp_path / "data", linked) == linked
     assert cache_folder(tmp_path, None) == tmp_path / "lang3dxl_cache"
+
+
+IN_CACHES = [
+    *("", "xfeat", "numbered", "dsp-sift", "adding", "sparse", "xfeat/000000.safetensors", "pairs.txt"),
+    *("database.db", "adding/database.db", "adding/pairs.txt", "dsp-sift/importing.db-journal"),
+]
+
+
+@pytest.mark.parametrize("place", IN_CACHES)
+@pytest.mark.parametrize("call", [reconstruct_scene, lambda data: add_photos(data, data)])
+def test_who_made_a_scene_chooses_no_file_that_a_reconstruction_writes_or_deletes(tmp_path, place, call):
+    linked = tmp_path / "data/lang3dxl_cache/reconstruction" / place
+    linked.parent.mkdir(parents=True)
+    (tmp_path / "theirs").mkdir()
+    linked.symlink_to(tmp_path / "theirs")
+    with pytest.raises(UserError, match=rf"{linked} is a link"):
+        call(tmp_path / "data")
+    assert not list((tmp_path / "theirs").iterdir())
+
+
+def test_a_reconstructions_own_links_to_photos_are_no_fault_and_a_pipe_is_not_waited_for(tmp_path):
+    work = work_folder(tmp_path, None)
+    (work / "adding/numbered").mkdir(parents=True)
+    (work / "adding/numbered/000000.jpg").symlink_to(tmp_path / "photo.jpg")
+    assert work_folder(tmp_path, None) == work
+    os.mkfifo(work / "pairs.txt")
+    with pytest.raises(UserError, match=r"pairs\.txt is a link or pipe"):
+        work_folder(tmp_path, None)
+
+
+@pytest.mark.parametrize("name", ["", "images", "images/0000.png", "views.json"])
+def test_views_of_a_splat_go_through_no_link_that_came_with_its_scene(tmp_path, name):
+    folder, splats = tmp_path / ".a.views", painted_scene().splats
+    (folder / name).parent.mkdir(parents=True, exist_ok=True)
+    (folder / name).symlink_to(tmp_path)
+    with pytest.raises(UserError, match="is a link"):
+        rendered_views(splats, 4, "z", folder)
+
+
+@pytest.mark.parametrize("name", ["lang3dxl_cache", ".images.partial"])
+def test_frames_of_a_video_go_through_no_link(tmp_path, name, monkeypatch):
+    folder = frames_folder(tmp_path / "a.mp4")
+    folder.mkdir()
+    (folder / name).symlink_to(tmp_path)
+    monkeypatch.setattr(video.shutil, "which", lambda _: "ffmpeg")
+    monkeypatch.setattr(video, "_duration", lambda _: 1.0)
+    monkeypatch.setattr(video, "_looks", lambda _: (np.arange(4.0), np.zeros(4)))
+    with pytest.raises(UserError, match="is a link"):
+        video.extract_frames(tmp_path / "a.mp4")
 
 
 @pytest.mark.parametrize("path", ["a" * 5000, "a/" * 3000, "a\0.scene", "a" * 300 + ".ply"])

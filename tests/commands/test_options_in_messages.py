@@ -29,7 +29,7 @@ COMMAND = re.compile(
     r"lang3dxl ((?:evaluate )?[a-z-]+)|(ns-train|lang3dxl-colmap)|(?:hf|convmv|ray|ns-process-data) "
 )
 OPTION = re.compile(r"(?<![\w-])--[a-z][\w.-]*")
-AMISS = re.compile(r"(?:data|model)_option\(|OPTION True|^(?!.*ns-train).*lang3dxl-colmap")
+AMISS = re.compile(r"(?:data|model|capture)_option\(|OPTION True|^(?!.*ns-train).*lang3dxl-colmap")
 """What these rooms may not say: a call in a text without its f, a flag's value, ns-train's word alone."""
 SPELLERS = {
     "data_option": "--pipeline.datamanager.",

@@ -16,10 +16,11 @@ from scenes import speckled, write_scene
 from scipy.spatial.transform import Rotation
 
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.files import locked
 from lang3dxl_ns.plugin.datamanager import Lang3DXLDataManagerConfig
 from lang3dxl_ns.plugin.dataparser import PhotoCollectionDataParserConfig, parser_for
 from lang3dxl_ns.scene.layout import images_folder
-from lang3dxl_ns.scene.video import _looks, _sharpest, extract_frames
+from lang3dxl_ns.scene.video import _looks, _sharpest, _write, extract_frames
 
 needs_ffmpeg = pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="ffmpeg is not installed")
 
@@ -190,6 +191,36 @@ def test_a_videos_place_may_have_a_percent_sign(tmp_path):
     subprocess.run(["ffmpeg", "-v", "error", *graph, str(video)], check=True)
     frames = extract_frames(video)
     assert frames.parent == video.parent and len(list((frames / "images").iterdir())) == 2
+
+
+@needs_ffmpeg
+@pytest.mark.parametrize(
+    ("name", "rate", "filters"),
+    [("a.mp4", 30, "null"), ("a.mkv", 30, "select='not(mod(n,3))+gt(n,30)'"), ("a.avi", 2, "null")],
+    ids=["steady", "unsteady", "slow, in ticks of half a second"],
+)
+def test_each_frame_of_a_video_is_looked_at_and_written_once(tmp_path, name, rate, filters):
+    """By options that ffmpeg has long had: -fps_mode came in 5.1."""
+    graph = ["-f", "lavfi", "-i", f"testsrc=size=64x48:rate={rate},trim=end_frame=60", "-vf", filters]
+    command = ["ffmpeg", "-v", "error", *graph, "-fps_mode", "vfr", str(tmp_path / name)]
+    subprocess.run(command, check=True)
+    sharpness, _ = _looks(tmp_path / name)
+    assert len(sharpness) == (40 if "select" in filters else 60)
+    _write(tmp_path / name, tmp_path / "frames", np.arange(len(sharpness)))
+    assert len(list((tmp_path / "frames/images").iterdir())) == len(sharpness)
+
+
+@needs_ffmpeg
+def test_what_ffmpeg_says_of_a_video_that_it_cannot_read_is_told(tmp_path):
+    with pytest.raises(UserError, match=r"ffmpeg can't read .*a\.mp4 \(.*No such file.*copy it again"):
+        _looks(tmp_path / "a.mp4")
+
+
+@needs_ffmpeg
+def test_a_second_command_that_reads_the_same_video_ends_at_once(walk, tmp_path):
+    film = make_video(walk, tmp_path / "walk.mp4")
+    with locked(tmp_path / "walk_photos"), pytest.raises(UserError, match="another command writes frames"):
+        extract_frames(film)
 
 
 def test_a_video_without_ffmpeg_is_an_error_that_names_it(tmp_path, monkeypatch):

@@ -261,7 +261,7 @@ def test_no_readable_photo_at_all_is_a_users_error(photos, config, store):
 
 def test_the_announced_size_is_that_of_the_stored_numbers(photos, config, store, capsys, monkeypatch):
     needed = []
-    monkeypatch.setattr(module, "_gigabytes", lambda size: needed.append(size) or f"{size} bytes")
+    monkeypatch.setattr(module, "gigabytes", lambda size: needed.append(size) or f"{size} bytes")
     run(photos, config, store, regions=FelzenszwalbRegions())
     kinds = ("clip", "dense", "regions")
     payload = [tensor for name in NAMES for kind in kinds for tensor in store.read(kind, name).values()]

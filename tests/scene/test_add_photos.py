@@ -6,6 +6,7 @@ import shutil
 import sqlite3
 from contextlib import closing
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np  # before pycolmap
 import pycolmap
@@ -126,13 +127,23 @@ def test_a_photo_of_another_size_finds_its_own_lens(scene):
     assert max(distances[f"late/{name}"] for name in LATE) < 0.3  # of about 4 to the box
 
 
-def test_the_report_and_the_picture_know_the_new_photos(scene, monkeypatch):
-    work = scene / "data/lang3dxl_cache/reconstruction"
-    before, doubted = (work / "cameras.png").read_bytes(), doubtful_photos(work.parent)
+@pytest.mark.parametrize("earlier", ["its own", "another model's", None])
+def test_the_report_and_the_picture_know_the_new_photos(scene, monkeypatch, earlier):
+    """Of photos that were doubtful before, only the model's own stay: other scenes have the same names."""
+    work, place = scene / "data/lang3dxl_cache/reconstruction", scene / "data/sparse/0"
+    before, told = (work / "cameras.png").read_bytes(), json.loads((work / "report.json").read_text())
+    told["doubtful"] = {"photo_000.jpg": "it looks up"}
+    if earlier == "another model's":
+        told["model"] = "0" * 32
+    (work / "report.json").write_text(json.dumps(told))
+    if earlier is None:
+        (work / "report.json").unlink()
+    known = told["doubtful"] if earlier == "its own" else {}
+    assert doubtful_photos(work.parent, place) == known
     monkeypatch.setattr(module, "doubtful_placements", lambda *_: dict.fromkeys(range(1, 8), "it looks away"))
     add_photos(scene / "data", scene / "late", None, SIFT)
     added = {f"late/{name}": "it looks away" for name in LATE}
-    assert doubtful_photos(work.parent) == doubted | added
+    assert doubtful_photos(work.parent, place) == known | added
     assert (work / "cameras.png").read_bytes() != before
 
 
@@ -284,12 +295,82 @@ def test_a_mapper_has_nothing_to_do(scene):
         add_photos(scene / "data", scene / "late", None, replace(SIFT, mapper="global"))
 
 
-def test_the_model_as_it_was_is_kept(scene):
-    files = {path.name: path.read_bytes() for path in (scene / "data/sparse/0").iterdir()}
-    add_photos(scene / "data", scene / "late", None, SIFT)
-    kept = scene / "data/lang3dxl_cache/reconstruction/before_adding_1"
+@pytest.mark.parametrize("place", ["sparse/0", "."])
+def test_the_model_as_it_was_is_kept_and_what_else_is_in_its_folder_stays(scene, place):
+    """The folder may be the photos'. A text beside the binary files would be the model that was."""
+    data = scene / "data"
+    place = data / place
+    pycolmap.Reconstruction(data / "sparse/0").write_text(data / "sparse/0")
+    files = {path.name: path.read_bytes() for path in (data / "sparse/0").iterdir()}
+    if place == data:
+        for name in files:
+            shutil.move(data / "sparse/0" / name, data / name)
+        shutil.rmtree(data / "sparse")
+    (place / "notes").mkdir()
+    others = [path for path in (place, *place.iterdir(), *data.glob("images/*")) if path.name not in files]
+    inodes = [path.stat().st_ino for path in others]
+    assert add_photos(data, scene / "late", None, SIFT) == place
+    assert [path.stat().st_ino for path in others] == inodes
+    assert {path.name for path in place.iterdir() if path.is_file()} == {
+        n for n in files if n.endswith("bin")
+    }
+    kept = data / "lang3dxl_cache/reconstruction/before_adding_1"
     assert {path.name: path.read_bytes() for path in kept.iterdir()} == files
     with pytest.raises(UserError, match="holds no photos that the model lacks"):
+        add_photos(scene / "data", scene / "late", None, SIFT)
+
+
+def test_a_model_that_a_full_disk_cuts_off_replaces_nothing(scene, monkeypatch):
+    """COLMAP writes on and is silent."""
+    write, place = pycolmap.Reconstruction.write_binary, scene / "data/sparse/0"
+
+    def cut_off(model, folder):
+        write(model, folder)
+        os.truncate(folder / "images.bin", 500)
+
+    files = {path.name: path.read_bytes() for path in place.iterdir()}
+    monkeypatch.setattr(pycolmap.Reconstruction, "write_binary", cut_off)
+    with pytest.raises(UserError, match=r"can't be written to .*sparse/0 .*: make room"):
+        add_photos(scene / "data", scene / "late", None, SIFT)
+    assert {path.name: path.read_bytes() for path in place.iterdir()} == files
+
+
+def test_a_copy_that_was_interrupted_leaves_nothing(scene, monkeypatch):
+    """Else it would be taken for another photo of that name."""
+    monkeypatch.setattr(os, "fsync", lambda _: os.write(-1, b""))
+    with pytest.raises(OSError, match="Bad file descriptor"):
+        module._copy(scene / "late", {LATE[0]: "copies/a.jpg"})
+    assert not list((scene / "late/copies").iterdir())
+    monkeypatch.undo()
+    module._copy(scene / "late", {LATE[0]: "copies/a.jpg"})
+    copy, photo = scene / "late/copies/a.jpg", scene / "late" / LATE[0]
+    assert copy.read_bytes() == photo.read_bytes() and copy.stat().st_mtime_ns == photo.stat().st_mtime_ns
+
+
+@pytest.mark.parametrize("linked", [None, "data", "data/images"])
+def test_new_photos_are_copied_wherever_links_and_relative_paths_lead(scene, monkeypatch, linked):
+    data, late = Path("data"), Path("late")
+    monkeypatch.chdir(scene)
+    if linked:
+        (scene / "far/away").mkdir(parents=True)
+        shutil.move(linked, scene / "far/away/moved")
+        Path(linked).symlink_to(scene / "far/away/moved")
+    else:  # photos in the scene's folder itself
+        for photo in Path("data/images").iterdir():
+            shutil.move(photo, "data")
+        Path("data/images").rmdir()
+        monkeypatch.chdir("data")
+        data, late = Path(), Path("../late")
+    photos = read_reconstruction(add_photos(data, late, None, SIFT)).photos
+    added = {f"late/{name}" for name in LATE}
+    assert len(photos) == 7 and added < set(photos)
+    assert added < set(find_photos(scene / "data").names)
+
+
+def test_a_model_behind_a_link_out_of_the_scene_is_not_replaced(scene):
+    shutil.move(scene / "data/sparse", scene / "other")
+    (scene / "data/sparse").symlink_to(scene / "other")
+    with pytest.raises(UserError, match="leads out of"):
         add_photos(scene / "data", scene / "late", None, SIFT)
 
 
@@ -339,6 +420,35 @@ def test_a_model_as_text_of_unknown_features_and_photos_that_lie_among_its_own(s
     assert (place / "images.txt").is_file() and not (place / "images.bin").exists()
     distances = errors(place, scene / "true/sparse/0")
     assert len(distances) == 7 and max(distances.values()) < 0.15
+
+
+@pytest.mark.parametrize(
+    ("part", "kept"),
+    [
+        ("points3D", lambda line: " ".join(line.split()[:4])),
+        ("images", lambda line: line * line.endswith("jpg")),
+    ],
+    ids=["no colors", "no keypoints"],
+)
+def test_a_text_model_that_lacks_what_new_photos_need_is_refused_before_the_work(
+    scene, extracted, part, kept
+):
+    place = scene / "data/sparse/0"
+    pycolmap.Reconstruction(place).write_text(place)
+    for path in (*place.glob("*.bin"), place / "rigs.txt", place / "frames.txt"):
+        path.unlink()
+    lines = [line for line in (place / f"{part}.txt").read_text().splitlines() if line[0] != "#"]
+    (place / f"{part}.txt").write_text("".join(f"{kept(line)}\n" for line in lines))
+    assert len(read_reconstruction(place).photos) == 5
+    with pytest.raises(UserError, match=r"sparse/0 can't be added to .*: export it in binary form"):
+        add_photos(scene / "data", scene / "late", None, SIFT)
+    assert extracted == []
+
+
+def test_a_photo_of_the_model_in_which_nothing_is_found_has_no_part(scene, monkeypatch):
+    monkeypatch.setattr(pairing, "EXHAUSTIVE", 0)
+    Image.new("RGB", (240, 180), "gray").save(scene / "data/images/photo_000.jpg")
+    assert len(contents(add_photos(scene / "data", scene / "late", None, SIFT))[0]) > 5
 
 
 def test_a_stopped_addition_goes_on_with_what_it_has(scene, monkeypatch):

@@ -4,10 +4,11 @@ import base64
 import json
 import struct
 import zlib
+from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image, PngImagePlugin
+from PIL import ExifTags, Image, PngImagePlugin
 from scenes import write_ply, write_scene, write_transforms
 from scipy.spatial.transform import Rotation
 
@@ -15,6 +16,7 @@ from lang3dxl_ns.attachment.learn import photos_of
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.pictures import mask_values, open_picture
 from lang3dxl_ns.preparation.settings import PreparationConfig
+from lang3dxl_ns.scene import capture
 from lang3dxl_ns.scene.capture import CaptureSettings, open_capture, recorded_capture
 from lang3dxl_ns.scene.colmap import read_reconstruction
 from lang3dxl_ns.scene.frame import Frame, find_frame, lost_cameras
@@ -210,6 +212,41 @@ def test_a_model_of_jpegs_finds_the_same_photos_as_png(folder):
     assert open_capture(folder).names == [f"photo_{i:03d}.PNG" for i in range(6)]
 
 
+def test_a_name_is_not_ambiguous_for_files_that_are_never_read():
+    files = ["r_0.png", "r_0.exr", "b.CR2", "b.jpg", "c.exr", "c.cr2"]
+    found, refused = resolve(["images/r_0", "b", "c"], files.__contains__, lambda: files, "photos")
+    assert found == {"images/r_0": "r_0.png", "b": "b.jpg"} and set(refused) == {"c"}
+
+
+@pytest.mark.parametrize("setting", ["colmap_path", "images_path", "masks_path"])
+@pytest.mark.parametrize("name", ["undistortd", "~/undistortd"])
+def test_a_misspelled_part_of_a_scene_is_told_by_name(folder, setting, name):
+    with pytest.raises(UserError, match="undistortd"):
+        open_capture(folder, CaptureSettings(**{setting: Path(name)}))
+
+
+def test_photos_that_are_links_are_refused_before_they_are_reconstructed(folder, tmp_path, monkeypatch):
+    """Training would refuse all of them after hours."""
+    made = []
+    monkeypatch.setattr(capture, "reconstruct_scene", lambda *given: made.append(given) or given)
+    (tmp_path / "links").mkdir()
+    for path in (folder / "images").iterdir():
+        (tmp_path / "links" / path.name).symlink_to(path)
+    with pytest.raises(UserError, match=r"photo_000.* leads out of .*links with --follow-links"):
+        capture.find_source(tmp_path / "links", CaptureSettings())
+    assert made == []
+    capture.find_source(tmp_path / "links", CaptureSettings(follow_links=True))
+    assert len(made) == 1
+
+
+def test_a_link_to_nothing_is_no_photo_of_another_scenes_cache(folder, tmp_path):
+    stamp = tmp_path / "cache" / REPORT.with_name("photos.json")
+    stamp.parent.mkdir(parents=True)
+    stamp.write_text(json.dumps({"photos": [["a.png", 1]]}))
+    (folder / "images" / "gone.png").symlink_to(tmp_path / "gone.png")
+    assert len(open_capture(folder, cache_dir=tmp_path / "cache").photos) == 6
+
+
 # ── masks ───────────────────────────────────────────────────────────────────────────────────────────────
 
 
@@ -311,8 +348,11 @@ def test_colmap_gets_a_jpeg_of_a_heic_and_the_right_ending_of_others(tmp_path):
     (tmp_path / "a.heic").write_bytes(heic())
     Image.new("RGB", (8, 6)).save(tmp_path / "b.jfif", "JPEG")
     Image.new("RGB", (8, 6)).save(tmp_path / "c.jpe", "PNG")
+    exif = Image.Exif()
+    exif[ExifTags.Base.ImageDescription] = "x" * 70_000  # more than a JPEG holds
+    Image.new("RGB", (8, 6)).save(tmp_path / "d.webp", exif=exif)
     copies = numbered(find_photos(tmp_path), tmp_path / "work")
-    assert copies.names == ("000000.jpg", "000001.jpg", "000002.png")
+    assert copies.names == ("000000.jpg", "000001.jpg", "000002.png", "000003.jpg")
     with Image.open(copies.folder / "000000.jpg") as image:
         assert image.size == (24, 32)
 

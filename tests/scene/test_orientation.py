@@ -12,7 +12,7 @@ from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.scene.camera import Lens
 from lang3dxl_ns.scene.capture import open_capture
 from lang3dxl_ns.scene.colmap import TrackedPhoto
-from lang3dxl_ns.scene.photo import Photo, stored_size, turned_lens, upright, upright_in_model
+from lang3dxl_ns.scene.photo import Photo, stored_size, turned_lens, upright
 
 LENS = Lens(60, 40, 70.0, 75.0, 28.0, 21.0, (-0.2, 0.05, 0.01, -0.015))
 STORED = {1: 6, 2: 3, 3: 8}
@@ -62,7 +62,9 @@ def test_a_photo_stored_lying_is_read_as_the_same_photo_stored_upright(tmp_path,
     store(tmp_path / "lying.png", pixels, quarters)
     assert np.array_equal(ImageOps.exif_transpose(Image.open(tmp_path / "lying.png")), pixels)
     straight = Photo("a", tmp_path / "upright.png", None, turned_lens(LENS, quarters))
-    lying = Photo.from_model(upright_in_model(tracked(), tmp_path / "lying.png"), tmp_path / "lying.png")
+    lying = Photo.from_model(
+        upright(tracked(), *stored_size(tmp_path / "lying.png", "lying")), tmp_path / "lying.png"
+    )
     assert lying.lens == straight.lens
     assert (lying.read_uint8() == straight.read_uint8()).all()
     assert (lying.read_file(30) == straight.read_file(30)).all()
@@ -107,7 +109,7 @@ def test_masks_and_labels_may_be_drawn_on_either(tmp_path, quarters, drawn):
 def test_a_model_of_photos_that_were_turned_before_is_left_as_it_is(tmp_path):
     store(tmp_path / "lying.png", np.zeros((40, 60, 3), np.uint8), 1)  # 40 wide and 60 high as stored
     assert stored_size(tmp_path / "lying.png", "a") == ((40, 60), 1)
-    found = upright_in_model(tracked(), tmp_path / "lying.png")
+    found = upright(tracked(), *stored_size(tmp_path / "lying.png", "lying"))
     assert found.lens == LENS and found.quarter_turns == 1
     photo = Photo.from_model(found, tmp_path / "lying.png")
     assert photo.read_uint8().shape == (40, 60, 3)

@@ -67,6 +67,14 @@ def test_photos_of_several_sizes_without_exif_have_a_camera_each(tmp_path):
     assert groups(tmp_path) == [["a.jpg"], ["b.jpg"], ["c.jpg"]]
 
 
+def test_photos_of_several_sizes_cannot_have_one_camera(tmp_path):
+    for i in range(4):
+        put(tmp_path / f"{i}.jpg", size=(40 + i % 2, 30))
+    photos = find_photos(tmp_path)
+    with pytest.raises(UserError, match=r"1\.jpg, 3\.jpg can't share the camera of 0\.jpg"):
+        feature_database(photos, photos, tmp_path, ReconstructionSettings(one_camera=True))
+
+
 def test_each_folder_of_frames_without_exif_has_one_camera(tmp_path):
     """Two videos, and photos of strangers beside them."""
     for folder, sizes in {
@@ -120,7 +128,7 @@ def test_few_photos_are_matched_all_with_all():
     assert pairs_to_match(["a", "b", "c"], None, "abc", []) == [("a", "b"), ("a", "c"), ("b", "c")]
 
 
-def test_similar_photos_find_each_other():
+def test_similar_photos_find_each_other(monkeypatch):
     """Photos of four places, whose descriptors are drawn around those of their place."""
     rng = np.random.default_rng(0)
     places = rng.integers(0, 255, (4, 60, 128))
@@ -129,11 +137,12 @@ def test_similar_photos_find_each_other():
         name: (places[int(name) % 4] + rng.normal(0, 20, (60, 128))).clip(0, 255).astype(np.uint8)
         for name in names
     }
-    pairs = similar_pairs(sorted(names), described.__getitem__, 5, names)
+    monkeypatch.setattr(pairing, "ALIKE", 5)
+    pairs = similar_pairs(sorted(names), described.__getitem__, names)
     assert {(int(a) - int(b)) % 4 for a, b in pairs} == {0}
     assert len(pairs) == 4 * 15
     new = {"11", "22"}
-    found = similar_pairs(sorted(names), described.__getitem__, 5, new)
+    found = similar_pairs(sorted(names), described.__getitem__, new)
     assert found == [pair for pair in pairs if not new.isdisjoint(pair)]
 
 
@@ -146,13 +155,14 @@ def test_photos_that_match_the_same_one_are_paired_unless_they_were():
 def test_photos_without_features_look_like_no_other():
     same = np.random.default_rng(0).integers(0, 255, (60, 128), dtype=np.uint8)
     described = {"a": same, "b": same[:0], "c": same, "d": same[:0]}
-    assert similar_pairs("abcd", described.__getitem__, 5, "abcd") == [("a", "c")]
+    assert similar_pairs("abcd", described.__getitem__, "abcd") == [("a", "c")]
 
 
-def test_a_photo_finds_the_one_that_finds_another_first():
+def test_a_photo_finds_the_one_that_finds_another_first(monkeypatch):
+    monkeypatch.setattr(pairing, "ALIKE", 1)
     a, b, c = np.random.default_rng(0).integers(0, 255, (3, 60, 128), dtype=np.uint8)
     described = {"a": a, "b": np.concatenate([a[:20], b[20:]]), "c": np.concatenate([c[:20], a[20:]])}
-    assert similar_pairs("abc", described.__getitem__, 1, "abc") == [("a", "b"), ("a", "c")]
+    assert similar_pairs("abc", described.__getitem__, "abc") == [("a", "b"), ("a", "c")]
 
 
 def test_large_collections_are_matched_with_neighbors_alone(monkeypatch):

@@ -2,6 +2,7 @@
 
 import os
 import shutil
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np  # before pycolmap
@@ -10,6 +11,7 @@ import pytest
 from PIL import Image
 from scenes import CENTER, HALF_SIZES, speckled, write_scene
 
+from lang3dxl_ns.commands.prepare import Reconstruct
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import locked
 from lang3dxl_ns.scene import matching, pairing
@@ -242,6 +244,38 @@ def test_a_model_that_is_there_is_left_as_it_is(photos, capsys):
         reconstruct_scene(photos, None, SIFT)
     assert "without a COLMAP model" not in capsys.readouterr().out
     assert (photos / "sparse" / "0" / "images.bin").read_bytes() == b"precious"
+
+
+def test_a_model_that_a_full_disk_cuts_off_is_none_and_the_command_can_be_repeated(photos, monkeypatch):
+    """COLMAP writes on and is silent."""
+    write = pycolmap.Reconstruction.write_binary
+
+    def cut_off(model, folder):
+        write(model, folder)
+        os.truncate(folder / "points3D.bin", 500)
+
+    with monkeypatch.context() as full:
+        full.setattr(pycolmap.Reconstruction, "write_binary", cut_off)
+        with pytest.raises(UserError, match="make room, and run the same command again"):
+            reconstruct_scene(photos, None, SIFT)
+    assert not (photos / "sparse").exists()
+    assert len(read_reconstruction(reconstruct_scene(photos, None, SIFT)[1]).photos) == 7
+
+
+def test_a_disk_that_is_too_small_for_the_features_is_told_before_the_work(photos, monkeypatch):
+    usage = shutil.disk_usage(".")
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=4_000_000))
+    monkeypatch.setattr(pycolmap, "extract_features", None)
+    with pytest.raises(UserError, match=r"features of 7 photos need 4\.87 MB in .*, and 4\.00 MB are free"):
+        reconstruct_scene(photos, None, SIFT)
+
+
+@pytest.mark.parametrize("cache", [None, Path("my cache")])
+def test_the_command_that_is_told_finds_the_report_in_its_cache(monkeypatch, capsys, cache):
+    monkeypatch.setattr(module, "reconstruct_scene", lambda *_: (Path("my photos"), Path("sparse/0")))
+    Reconstruct(data=Path("my photos"), cache_dir=cache).main()
+    told = "Train with: lang3dxl train 'my photos'" + " --cache-dir 'my cache'" * (cache is not None)
+    assert capsys.readouterr().out.endswith(f"{told}\n")
 
 
 def test_where_sparse_is_taken_the_model_goes_to_the_cache(photos):

@@ -65,12 +65,12 @@ def test_marks_are_pixels_of_the_file_where_training_read_it_smaller(turns, tmp_
 
 
 def test_a_doubtful_place_is_kept_from_the_reconstruction_to_the_record(tmp_path):
-    assert doubtful_photos(tmp_path) == {}
+    assert doubtful_photos(tmp_path, tmp_path) == {}
     report = ReconstructionReport(2, 2, 9, 0.5, 1, "incremental", doubtful={"a": "it looks away"})
     (tmp_path / REPORT).parent.mkdir()
     (tmp_path / REPORT).write_text(json.dumps(asdict(report)))
     pose, photo = torch.eye(4)[:3].tolist(), Photo("a", tmp_path / "a", None, Lens(30, 20, 30, 30, 15, 10))
-    described = ScenePhoto.of(photo, "train", pose, 1.0, doubtful_photos(tmp_path).get("a"))
+    described = ScenePhoto.of(photo, "train", pose, 1.0, doubtful_photos(tmp_path, tmp_path).get("a"))
     SceneRecord([described], None, None, 1.0, pose, "data").write(tmp_path / "scene.json")
     assert SceneRecord.read(tmp_path / "scene.json").photos[0].doubtful == "it looks away"
 
