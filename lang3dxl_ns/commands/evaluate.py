@@ -18,8 +18,8 @@ from lang3dxl_ns.common.settings_help import showing
 from lang3dxl_ns.evaluation.aggregate import average, pool, pooled_table, read_results, scene_table
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth, Layout, held_out_photos
 
-REPORT = "scores"
-"""Name of the report's files, without suffix."""
+REPORT, THINGS = "scores", "thing_scores"
+"""Names of the report's files, without suffix, and of that on things: `lang3dxl things` has a things.json."""
 _DRAWN = "draw objects white on black, or black on white for --layout holyscenes"
 
 
@@ -126,7 +126,7 @@ class EvaluateRun(_Scored):
 @showing("scene", "coco", "out")
 @dataclass(kw_only=True)
 class EvaluateThings(OfScene):
-    """Score single things against the boxes of labels, and write things.md and things.json."""
+    """Score single things against the boxes of labels, and write thing_scores.md and thing_scores.json."""
 
     coco: Path
     """COCO instances, or a folder of LERF-OVS labels: boxes in photos; their categories are the words."""
@@ -139,8 +139,8 @@ class EvaluateThings(OfScene):
 
         scores = score_things(load_scene(self.scene, clip=self.clip), self.coco)
         table = markdown_table(["word", "there", "found", "false", "F1"], scores)
-        write_report(self.out, "things", table, {"scores": scores})
-        print(f"{table}\n\nWrote {self.out / 'things'}.md")
+        write_report(self.out, THINGS, table, {"scores": scores})
+        print(f"{table}\n\nWrote {self.out / THINGS}.md")
 
 
 @showing("reports", "out")

@@ -8,7 +8,7 @@ from pathlib import Path
 import tyro
 
 from lang3dxl_ns.commands.of_scene import OfScene
-from lang3dxl_ns.common.console import say
+from lang3dxl_ns.common.console import say, some
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.settings_help import showing
 
@@ -33,16 +33,20 @@ class ListThings(OfScene):
     """Write a splat file for each thing too, and scene.glb with things as features (EXT_mesh_features)."""
 
     def main(self) -> None:
+        from lang3dxl_ns.files.coco import check_labels_file
         from lang3dxl_ns.open_scene import load_scene
         from lang3dxl_ns.query.ask import prompts_of
         from lang3dxl_ns.query.text import Prompt, caution
-        from lang3dxl_ns.things.grammar import Request, answered, meant, parse, sight_of
+        from lang3dxl_ns.things.grammar import Request, answered, facing, meant, parse
         from lang3dxl_ns.things.write import each_word_once, table, write_catalog, write_picture, write_things
 
         if not (self.text or self.ask):
             raise UserError("give --text or --ask: say which things to look for, such as --text windows")
         if self.splats and self.out is None:
             raise UserError("--splats writes files: give --out too")
+        if self.out is not None:
+            check_labels_file(self.out / "things.json")
+            check_labels_file(self.out / "instances.json")
         scene = load_scene(self.scene, clip=self.clip)
         if self.view is not None:
             scene.file.photo(self.view)
@@ -60,27 +64,27 @@ class ListThings(OfScene):
         for prompt, one in zip(prompts, answers, strict=True):
             say(f"{one.word}: {one.count}" + (f" ({one.caution})" if one.caution else ""))
             if prompt.taught is None:
-                other = meant(one.word, scene.words)
-                advice = caution(one.word), other and f"did you mean {other}?"
+                other = meant(prompt.text, scene.words)
+                advice = caution(prompt.text, counted=True), other and f"did you mean {other}?"
                 say(*(f"  {line}" for line in advice if line))
         named = each_word_once(answers[: len(own)])
         if any(one.things for one in named):
             say(*table(scene, named))
-        every = [thing for one in answers for thing in (*one.things, *one.candidates)]
-        seen = None if self.view is None else sight_of(scene, every, self.view)
+        sight = facing(scene, answers, self.view)
         for text, request in requests.items():
             try:
                 found = [by_word[word] for word in request.words]
-                say(f"{text}: {answered(request, found, lambda things: seen or sight_of(scene, things))}")
+                say(f"{text}: {answered(request, found, sight)}")
             except UserError as error:
                 refused.append(_refusal(text, error))
         if self.out is not None and answers:
             listed = each_word_once(answers)
             write_catalog(scene, listed, self.out)
             write_picture(scene, listed, self.out / "things.png")
-            if self.splats:
-                write_things(scene, listed, self.out / "splats")
+            new = write_things(scene, listed, self.out / "splats") if self.splats else []
             say(f"Wrote the things to {self.out}")
+            if old := sorted(path.name for path in {*(self.out / "splats").glob("*.*")} - {*new}):
+                say(f"{self.out / 'splats'} has files that are not of this call: {some(old)}")
         if not self.text and len(refused) == len({*self.ask}):
             raise UserError("; ".join(refused))
         say(*refused)

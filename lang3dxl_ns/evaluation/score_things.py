@@ -6,18 +6,25 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from jaxtyping import Float
 from numpy import ndarray as Array
+from scipy.ndimage import find_objects
 from scipy.optimize import linear_sum_assignment
 
 from lang3dxl_ns.common.console import say, some
 from lang3dxl_ns.common.errors import UserError, readable
 from lang3dxl_ns.common.files import read_json
 from lang3dxl_ns.evaluation.ground_truth import GroundTruth
+from lang3dxl_ns.files.coco import is_ours
 from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.query.text import Prompt
 from lang3dxl_ns.scene.names import resolve
+from lang3dxl_ns.scene.record import ScenePhoto
 from lang3dxl_ns.things.write import coco
+
+MOST_SIDE = 2048
+"""Pixels of the longer side, at most, at which boxes are undistorted."""
 
 
 def score_things(scene: Scene, path: Path) -> list[tuple[str, int, int, int, float | None]]:
@@ -46,6 +53,13 @@ def score_things(scene: Scene, path: Path) -> list[tuple[str, int, int, int, flo
             say(f"{len(absent)} photos of {path} fit none of this scene, or several: {some(absent)}")
     if not names or not words:
         raise UserError(f"{path} names no photo of this scene: file_name must be {scene.photos[0].name}, …")
+    if not path.is_dir():
+        drawn = [] if is_ours(content) else content["images"]  # ours are of undistorted photos
+        sizes = {image["file_name"]: (image["width"], image["height"]) for image in drawn}
+    bent = {one.name: one for one in scene.photos if one.lens.distorts or one.quarter_turns}
+    for (name, word), boxes in true.items():
+        if name in bent.keys() & sizes:
+            true[name, word] = _undistorted(bent[name], sizes[name], boxes)
     given, scores = _boxes(coco(scene, scene.things([Prompt(word) for word in words]))), []
     for word in words:
         sides = [[np.array(of.get((n, word), [])).reshape(-1, 4) for of in (true, given)] for n in names]
@@ -66,6 +80,19 @@ def _boxes(content: dict[str, Any]) -> dict[tuple[str, str], list[list[float]]]:
         corners = [x / wide, y / tall, (x + width) / wide, (y + height) / tall]
         found.setdefault((name, words[label["category_id"]]), []).append(corners)
     return found
+
+
+def _undistorted(photo: ScenePhoto, size: tuple[int, int], boxes: list[list[float]]) -> list[list[float]]:
+    """Return what bounds boxes in the undistorted photo that were drawn on its file, of this size. What lies
+    outside is left out: nothing can be found there."""
+    width, height = (max(round(side * min(1, MOST_SIDE / max(size))), 1) for side in size)
+    drawn = torch.arange(width * height, dtype=torch.int32).view(height, width)
+    places = photo.photo().undistort_labels(drawn).numpy()
+    x, y = (places % width + 0.5) / width, np.where(places < 0, np.nan, (places // width + 0.5) / height)
+    inside = ((left <= x) & (x < right) & (top <= y) & (y < bottom) for left, top, right, bottom in boxes)
+    found = (part for mask in inside for part in find_objects(mask.astype(np.uint8)))
+    ends = [(c.start, r.start, c.stop, r.stop) for r, c in found]
+    return (np.array(ends).reshape(-1, 4) / np.tile(places.shape[::-1], 2)).tolist()
 
 
 def _matches(true: Float[Array, "n 4"], given: Float[Array, "m 4"]) -> int:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,17 +17,25 @@ from lang3dxl_ns.common.errors import UserError, readable
 from lang3dxl_ns.common.files import read_json, write_atomically
 from lang3dxl_ns.words.taught_words import run_lengths
 
+OURS = {"description": "Matches in a scene of lang3dxl-ns"}
+"""What files that are ours, and so may be replaced, begin to say as their `info`."""
 _LEAST_PART = 1e-4
 """Share of a photo below which a separate part of a mask is no label."""
 
 
 def check_labels_file(path: Path) -> None:
-    """Raise UserError if labels can't be written to a path, or would replace a file of another kind."""
+    """Raise UserError if labels can't be written to a path, or would replace what we didn't write, such as
+    labels that a person drew."""
     if path.suffix != ".json" or path.is_dir():
-        raise UserError(f"--coco writes labels as JSON: {path} is not the name of a .json file")
+        raise UserError(f"labels are written as JSON: {path} is not the name of a .json file")
     if path.is_file() and path.stat().st_size:
-        with readable(f"{path} is another file than one of labels", "choose another name"):
-            expect({"images", "annotations"} <= {*read_json(path, 1 << 31)}, "it has no annotations")
+        with readable(f"{path} would be replaced, and is not ours", "choose another name, or move it"):
+            expect(is_ours(read_json(path, 1 << 31)), "a person may have drawn it")
+
+
+def is_ours(content: Mapping[str, Any]) -> bool:
+    """Return whether we wrote labels or a catalog of things. Their pixels are those of undistorted photos."""
+    return str(dict(content.get("info") or {}).get("description")).startswith(OURS["description"])
 
 
 class CocoLabels:
@@ -35,7 +43,7 @@ class CocoLabels:
 
     def __init__(self, categories: Sequence[str]) -> None:
         self.content: dict[str, Any] = {
-            "info": {"description": "Matches in a scene of lang3dxl-ns, drawn on the undistorted photos"},
+            "info": {"description": f"{OURS['description']}, drawn on the undistorted photos"},
             "images": [],
             "annotations": [],
             "categories": [{"id": i, "name": name} for i, name in enumerate(categories, start=1)],

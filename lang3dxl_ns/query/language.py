@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
+from unicodedata import normalize
 
 TABLE: dict[str, Any] = json.loads(Path(__file__).with_suffix(".json").read_text(encoding="utf-8"))
 HELD = "\ue000"
@@ -48,8 +49,7 @@ def held(typed: str, names: Iterable[str] = ()) -> tuple[str, Callable[[str], st
         return f"{HELD}{len(parts) - 1}{HELD}"
 
     def restored(text: str) -> str:
-        text = re.sub(f"{HELD}(\\d+){HELD}", lambda found: parts[int(found[1])], text)
-        return " ".join(text.replace('"', " ").split())
+        return tidy(re.sub(f"{HELD}(\\d+){HELD}", lambda found: parts[int(found[1])], text))
 
     text = straight(typed).replace("\0", " ").replace(HELD, " ")
     whole = re.compile(rf'"[^"]*"|{_words((*TABLE["one"], *names)).pattern}', re.IGNORECASE)
@@ -57,9 +57,15 @@ def held(typed: str, names: Iterable[str] = ()) -> tuple[str, Callable[[str], st
     return whole.sub(hold, " ".join(text.split())), restored
 
 
+def tidy(text: str) -> str:
+    """Return a phrase without quotes and extra spaces."""
+    return " ".join(text.replace('"', " ").replace("\0", " ").split())
+
+
 def straight(text: str) -> str:
-    """Return a text with straight double quotes in place of curly ones and of single ones in pairs."""
-    return re.sub(r"‘([^‘’]*)’", r'"\1"', text.translate(_CURLY_QUOTES))
+    """Return a text with straight double quotes in place of curly ones and of single ones in pairs, and with
+    accents in their letters."""
+    return re.sub(r"‘([^‘’]*)’", r'"\1"', normalize("NFC", text).translate(_CURLY_QUOTES))
 
 
 def phrases_of(typed: str, names: Iterable[str] = ()) -> list[tuple[str, list[str]]]:

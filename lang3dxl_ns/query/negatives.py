@@ -6,6 +6,7 @@ import re
 from collections.abc import Sequence
 from functools import lru_cache
 
+from lang3dxl_ns.query.language import TABLE
 from lang3dxl_ns.query.relevancy import CANONICAL
 
 _SURROUNDINGS: dict[str, tuple[str, ...]] = {
@@ -76,7 +77,6 @@ def _words(text: str) -> list[str]:
 
 def singulars(words: str) -> list[str]:
     """Return a word or term without punctuation, and those that it may be the plural of."""
-    endings = (("s", ""), ("es", ""), ("ies", "y"), ("ves", "f"), ("es", "is"), ("ia", "ion"), ("a", "um"))
     words = words.strip(".,;:!?'\"()")
-    forms = [words.removesuffix(plural) + one for plural, one in endings if words.endswith(plural)]
-    return [words, *forms, {"oculi": "oculus", "abaci": "abacus"}.get(words, words)]
+    endings = ((plural, one) for plural, one in TABLE["plurals"] if words.endswith(plural))
+    return [words, *(words.removesuffix(plural) + one for plural, one in endings)]

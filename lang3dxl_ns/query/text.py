@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import threading
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Literal
 
@@ -16,7 +16,7 @@ from torch import Tensor
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.query.doubt import UNRELATED
-from lang3dxl_ns.query.language import meaning, phrases_of, straight
+from lang3dxl_ns.query.language import meaning, phrases_of, straight, tidy
 from lang3dxl_ns.query.negatives import NEGATIVES, competitors
 from lang3dxl_ns.query.relevancy import Queries
 from lang3dxl_ns.query.vocabulary import searched, synonyms_of
@@ -52,6 +52,11 @@ class Prompt:
         """Raise TypeError if a text is not a string."""
         texts_of((self.text, *self.negatives), "a prompt")
 
+    @property
+    def name(self) -> str:
+        """The prompt in words, such as *windows not arches, doors*: other negatives make it another."""
+        return f"{self.text} not {', '.join(self.negatives)}" if self.negatives else self.text
+
 
 def texts_of(texts: Any, what: str) -> list[str]:
     """Return one text or several as a list, without unpaired UTF-16 surrogates (from a broken paste), which
@@ -85,11 +90,6 @@ def parse_prompts(typed: str, names: Iterable[str] = ()) -> list[Prompt]:
     return [Prompt(text, tuple(negatives)) for text, negatives in found]
 
 
-def tidy(text: str) -> str:
-    """Return a phrase without quotes and extra spaces."""
-    return " ".join(text.replace('"', " ").replace("\0", " ").split())
-
-
 def listed_phrases(texts: Iterable[str]) -> list[str]:
     """Return the phrases of texts that may list several, separated by `;` or commas, quoted or not."""
     parts = (re.findall(rf"{_QUOTED}|[^;,]+", straight(text)) for text in texts)
@@ -103,14 +103,16 @@ _MOST_WORDS = 50
 _NO_NAME = re.compile(r"an?|the|and|or|of|in|on|at|to|it|is|are|this|that|these|those|what|where|\d+")
 
 
-def caution(text: str) -> str | None:
+def caution(text: str, counted: bool = False) -> str | None:
     """Return a warning about a prompt that names nothing, such as *the* or *42*, or that has words which CLIP
-    can't tell (places, sizes, colors, an unquoted *not*); None for others."""
+    can't tell (places, sizes, colors, *how many* unless that is `counted`); None for others."""
     if all(_NO_NAME.fullmatch(word) for word in re.findall(r"\w+", text.casefold())):
         return f"{text} does not name a visible object: the results are arbitrary"
     if len(text.split()) > _MOST_WORDS:
         return f"CLIP reads about {_MOST_WORDS} words: the rest of this prompt is ignored"
-    return "; ".join(meaning(text).advice) or None
+    meant = meaning(text)
+    unused = tuple(one for one in meant.unused if not (counted and one[0] == "count"))
+    return "; ".join(replace(meant, unused=unused).advice) or None
 
 
 # ── settings ────────────────────────────────────────────────────────────────────────────────────────────

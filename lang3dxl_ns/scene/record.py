@@ -14,6 +14,7 @@ from dataclasses import asdict, dataclass, replace
 from difflib import get_close_matches
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal
+from unicodedata import normalize
 
 import numpy as np
 import torch
@@ -192,10 +193,11 @@ class SceneRecord:
     def photo(self, name: str) -> ScenePhoto:
         """Find the photo with this name, or with this file name or stem if only one photo has it. Raises
         UserError, which names similar photos, if there is none."""
-        for form in (str, lambda n: PurePosixPath(n).name, lambda n: PurePosixPath(n).stem):
-            found = [photo for photo in self.photos if form(photo.name) == name]
-            if len(found) == 1:
-                return found[0]
+        for wanted in (name, normalize("NFC", name), normalize("NFD", name)):  # accents in letters or behind
+            for form in (str, lambda n: PurePosixPath(n).name, lambda n: PurePosixPath(n).stem):
+                found = [photo for photo in self.photos if form(photo.name) == wanted]
+                if len(found) == 1:
+                    return found[0]
         names = [photo.name for photo in self.photos]
         similar = get_close_matches(name, names, n=3) or names[:3]
         raise UserError(f"the scene has no photo {name!r}: it has {len(names)}, such as {', '.join(similar)}")

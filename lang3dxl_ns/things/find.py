@@ -38,6 +38,8 @@ APART = 1.5
 """Space around a part of a thing, relative to the gap between groups, from which it is a thing of its own."""
 HEIGHTS = 0.01, 0.9995
 """Shares of a landmark's Gaussians that lie below the ground, and below its top."""
+UPRIGHT = 0.5
+"""Length of the mean of the cameras' vectors to the top of their pictures below which that is no up."""
 SURE = 0.6
 """Number of views, relative to the typical thing's, above which a thing is sure."""
 MISSED = 1.4
@@ -125,7 +127,7 @@ def things_of(scene: Answering, question: Question) -> list[Things]:
         sure = [one for one in sure if one not in better]
         rest = [one for one in joined if one not in sure]
         things, candidates = (
-            [_thing(prompt.text, one, boxed(one), mass, values) for one in some] for some in (sure, rest)
+            [_thing(prompt.name, one, boxed(one), mass, values) for one in some] for some in (sure, rest)
         )
         trust, far = question.trusts[i], (scene.foreignness or 0) >= FAR and prompt.taught is None
         caution = trust.reason if far or trust.level != "sure" else None
@@ -135,7 +137,7 @@ def things_of(scene: Answering, question: Question) -> list[Things]:
             caution = (
                 f"{'one' if shown_in else 'no'} training photo shows the scene, and a thing is what two show"
             )
-        answers.append(Things(prompt.text, things, candidates, caution))
+        answers.append(Things(prompt.name, things, candidates, caution))
     return answers
 
 
@@ -184,6 +186,12 @@ def up_of(scene: Answering) -> Float[Array, "3"]:
     up = np.array([photo.camera_to_world for photo in scene.photos])[:, :, 1].mean(0)
     up = up if told is None else np.asarray(told.up, dtype=np.float64)
     return up / max(np.linalg.norm(up), 1e-9)
+
+
+def is_upright(scene: Answering) -> bool:
+    """Return whether the cameras agree on up: where they look down from all sides, theirs cancel."""
+    mean = np.array([photo.camera_to_world for photo in scene.photos]).mean(0)
+    return bool(np.linalg.norm(mean[:, 1]) >= UPRIGHT)
 
 
 def heights_of(scene: Answering) -> Float[Array, "2"]:

@@ -7,7 +7,7 @@ import re
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -25,7 +25,7 @@ from lang3dxl_ns.query.language import HELD, TABLE, held
 from lang3dxl_ns.query.text import Prompt
 from lang3dxl_ns.query.vocabulary import closest_word, common_words
 from lang3dxl_ns.scene.record import ScenePhoto
-from lang3dxl_ns.things.find import MISSED, Things, things_of, up_of
+from lang3dxl_ns.things.find import MISSED, Things, is_upright, things_of, up_of
 from lang3dxl_ns.things.outlines import shown
 from lang3dxl_ns.things.thing import Thing
 
@@ -67,6 +67,11 @@ class Request:
         return [self, *(part for other in self.others for part in other.parts)]
 
     @property
+    def order(self) -> tuple[str, int]:
+        """What its things are ordered by (see `measure`), and the sign of the order, 0 for none."""
+        return table()["superlatives"].get(self.superlative) or table()["from"].get(self.along) or ("", 0)
+
+    @property
     def words(self) -> list[str]:
         """All prompts, each once."""
         return list(dict.fromkeys(w for part in self.parts for w in (part.word, part.without) if w))
@@ -81,19 +86,26 @@ class Sight:
     ahead: Float[Array, "3"]
     shown: frozenset[int] | None = None
     """Ids of the things that one sees: the order from left to right is theirs; None: all."""
+    upright: bool = True
+    """Whether the photos tell which way is up."""
+
+
+def best_photo(scene: Answering, things: Sequence[Thing]) -> ScenePhoto:
+    """Return the photo that shows most of the things; the overview if none shows any."""
+    names = [sighting.photo for thing in things for sighting in thing.sightings]
+    return scene.file.photo(max(sorted(set(names)), key=names.count)) if names else scene.overview
 
 
 def sight_of(scene: Answering, things: list[Thing], photo: str | None = None) -> Sight:
     """Return the directions of a photo's viewer, and which of the things it shows; by default of the photo
     that shows most of them, as if it showed all."""
-    names = [sighting.photo for thing in things for sighting in thing.sightings]
-    best = max(sorted(set(names)), key=names.count) if names else scene.overview.name
-    taken = scene.file.photo(best if photo is None else photo)
-    up = up_of(scene)
-    ahead = -np.array(taken.camera_to_world)[:, 2]
-    ahead = ahead - up * (ahead @ up)
-    ahead /= max(np.linalg.norm(ahead), 1e-9)
-    return Sight(np.cross(ahead, up), up, ahead, None if photo is None else _shown(scene, taken, things))
+    taken = best_photo(scene, things) if photo is None else scene.file.photo(photo)
+    up, (x, _, back, _) = up_of(scene), np.array(taken.camera_to_world).T
+    # The picture's right, which no look straight down mirrors; for a picture on its side, the viewer's.
+    right = max((x - up * (x @ up), np.cross(up, back)), key=np.linalg.norm)
+    right = right / max(np.linalg.norm(right), 1e-9)
+    seen = None if photo is None else _shown(scene, taken, things)
+    return Sight(right, up, np.cross(up, right), seen, is_upright(scene))
 
 
 def _shown(scene: Answering, photo: ScenePhoto, things: list[Thing]) -> frozenset[int]:
@@ -107,6 +119,14 @@ Facing = Callable[[list[Thing]], Sight]
 """Returns the directions in which some things are seen."""
 
 
+def facing(scene: Answering, found: Sequence[Things], photo: str | None) -> Facing:
+    """Return how things are seen: in a photo, which may show some of those found, or as `sight_of` does."""
+    if photo is None:
+        return partial(sight_of, scene)
+    seen = sight_of(scene, [thing for one in found for thing in (*one.things, *one.candidates)], photo)
+    return lambda _: seen
+
+
 def parse(text: str, names: Iterable[str] = ()) -> Request:
     """Parse a question. Quotes hold a phrase, and so do `names`, which were taught. Raises UserError, which
     names the part, for what the grammar doesn't know."""
@@ -117,12 +137,13 @@ def parse(text: str, names: Iterable[str] = ()) -> Request:
         raise UserError(
             f"this question has {len(rest):,} letters: ask for one thing, in {words['longest']} at most"
         )
-    count, rest = _taken(rest, TABLE["count"])
-    _, rest = _taken(rest, TABLE["lead"])
+    rest = re.sub(rf"(?<=st|nd|rd|th)-(?=(?:{_any(words['superlatives'])}) )", " ", rest)  # second-highest
+    asked = _plain(re.sub(rf"^(?:{_any(TABLE['lead'])})\s+", "", rest))
+    rest = re.sub(rf"^(?:{_any(TABLE['count'])})\s+", "", asked)
     relation, tail = _any(words["relations"]), _any(words["tail"])
     idle = rf" (?:that |which )?(?:are|is)(?: there)?(?= (?:{relation}) )| (?:{tail})$"
     try:
-        return replace(_request(re.sub(idle, "", rest), restored), count=count)
+        return replace(_request(re.sub(idle, "", rest), restored), count=rest != asked)
     except UserError as error:
         raise UserError(restored(str(error)).replace(" :", ":")) from None
 
@@ -158,7 +179,7 @@ def _request(rest: str, restored: Callable[[str], str]) -> Request:
     if noun and first in words["superlatives"] and not noun.startswith("of "):
         superlative, rest = first, noun
     for name in (rest, *([] if without is None else [without])):
-        _check_name(name)
+        _check_name(restored(name) and name)  # quotes may hold nothing
     if nth and not (along or superlative):
         raise UserError(f"{place} {rest}: say from which side, such as the {place} {rest} from the left")
     if along and (superlative or not nth):
@@ -195,10 +216,10 @@ def answer(request: Request, found: Sequence[Things], sight: Facing) -> list[Thi
         if missing := [other.word for other, there in zip(request.others, others, strict=True) if not there]:
             raise UserError(f"no {missing[0]} found: a relation to it has no answer")
         chosen = [t for t in chosen if _related(t, request.relation, others, view)]
-    order = table()["superlatives"].get(request.superlative) or table()["from"].get(request.along)
-    if not order:
+    kind, sign = request.order
+    if not sign:
         return chosen
-    (kind, sign), nth, where = order, request.nth or 1, ""
+    nth, where = request.nth or 1, ""
     if kind == "left" and view.shown is not None and chosen:
         chosen, where = [thing for thing in chosen if thing.id in view.shown], " in this view"
     if len(chosen) < nth and (request.nth or where):
@@ -251,9 +272,7 @@ def answer_question(scene: Answering, text: str, photo: str | None = None) -> An
     """Answer a question; see `Scene.answer`."""
     request = parse(text, scene.words)
     found = things_of(scene, ask(scene, [Prompt(word) for word in request.words]))
-    every = [thing for one in found for thing in (*one.things, *one.candidates)]
-    seen = None if photo is None else sight_of(scene, every, photo)
-    return answered(request, found, lambda things: seen or sight_of(scene, things))
+    return answered(request, found, facing(scene, found, photo))
 
 
 def unsure(request: Request, found: Sequence[Things], sight: Facing) -> str | None:
@@ -273,6 +292,8 @@ def unsure(request: Request, found: Sequence[Things], sight: Facing) -> str | No
         if len({_told(request, other, sight) for other in each}) > 1:
             wide.add(one.word)
     told = [f"{one.word}: {one.count}" for one in found if one.word in wide]
+    if any(part.relation in ("above", "below") or part.order[0] in ("top", "tall") for part in request.parts):
+        told += [] if sight([]).upright else ["the photos don't tell which way is up"]
     close = (_close(part, found, sight) for part in request.parts)
     return ", ".join(told) or next(filter(None, close), None)
 
@@ -285,8 +306,8 @@ def _told(request: Request, found: Sequence[Things], sight: Facing) -> int | fro
 
 
 def _close(request: Request, found: Sequence[Things], sight: Facing) -> str | None:
-    kind, sign = table()["superlatives"].get(request.superlative, ("left", 1))
-    if kind in ("left", "top") or _told(request, found, sight) is None:
+    kind, sign = request.order
+    if kind in ("", "left", "top") or _told(request, found, sight) is None:
         return None
     listed = answer(replace(request, superlative=None, nth=None), found, sight)
     view, nth = sight(listed), request.nth or 1
@@ -332,11 +353,6 @@ def _between(thing: Thing, a: Thing, b: Thing) -> bool:
     share = float((thing.center - a.center) @ line / max(line @ line, 1e-12))
     aside = np.linalg.norm(thing.center - a.center - share * line)
     return 0 < share < 1 and bool(aside < max(a.size.max(), b.size.max()))
-
-
-def _taken(text: str, phrases: list[str]) -> tuple[bool, str]:
-    found = re.match(rf"({_any(phrases)})\s+", text)
-    return found is not None, text[found.end() :] if found else text
 
 
 def _plain(text: str) -> str:

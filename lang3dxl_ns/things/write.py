@@ -16,15 +16,15 @@ from PIL import Image
 from scipy.ndimage import find_objects
 
 from lang3dxl_ns.common.console import tracked
-from lang3dxl_ns.common.files import make_folder, slugs, write_atomically
-from lang3dxl_ns.files.coco import CocoLabels
+from lang3dxl_ns.common.files import slugs, write_atomically
+from lang3dxl_ns.files.coco import OURS, CocoLabels
 from lang3dxl_ns.files.glb import encode_glb
 from lang3dxl_ns.files.splat_file import write_splats
 from lang3dxl_ns.query.match import save_picture
 from lang3dxl_ns.query.negatives import singulars
 from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.things.find import Things, heights_of, up_of
-from lang3dxl_ns.things.grammar import Sight, holds, sight_of
+from lang3dxl_ns.things.grammar import Sight, best_photo, holds, sight_of
 from lang3dxl_ns.things.outlines import held, numbered, outlined
 from lang3dxl_ns.things.pieces import LEAST
 from lang3dxl_ns.things.thing import Thing
@@ -60,7 +60,6 @@ def table(scene: Scene, answers: Sequence[Things]) -> list[str]:
 def write_catalog(scene: Scene, answers: Sequence[Things], folder: Path) -> None:
     """Write things.json (boxes, sizes, scores, photos, and the scene graph: what is in what, and neighbors),
     things.csv and instances.json (COCO labels of all photos)."""
-    make_folder(folder)
     things, place, up = [thing for _, _, thing in numbered(answers)], scene.file.georeference, up_of(scene)
     graph = _relations(things, sight_of(scene, things))
     words = [{"word": one.word, "count": len(one.things), "least": one.least, "most": one.most,
@@ -83,8 +82,8 @@ def write_catalog(scene: Scene, answers: Sequence[Things], folder: Path) -> None
         told = number, _cell(thing.word), thing.id, round(thing.score, 3), thing.views
         box = *thing.center.round(4).tolist(), *thing.size.round(4).tolist()
         lines.writerow([*told, *box, _cell(thing.best_photo), *(meters or [""] * 3)])
-    content = {"words": words, "things": listed, "relations": graph, "heights": [ground, top]}
-    content |= {"up": up.tolist(), "unit": None if place is None else asdict(place)}
+    content: dict[str, Any] = {"info": OURS, "words": words, "things": listed, "relations": graph}
+    content |= {"heights": [ground, top], "up": up.tolist(), "unit": None if place is None else asdict(place)}
     write_atomically(folder / "things.json", json.dumps(content, indent=1) + "\n")
     write_atomically(folder / "things.csv", rows.getvalue())
     write_atomically(folder / "instances.json", json.dumps(coco(scene, answers)) + "\n")
@@ -132,23 +131,21 @@ def coco(scene: Scene, answers: Sequence[Things]) -> dict[str, Any]:
 
 
 def write_picture(scene: Scene, answers: Sequence[Things], path: Path) -> None:
-    """Draw numbered outlines on the rendering of the photo that shows most of the things."""
-    names = [shown.photo for _, _, thing in numbered(answers) for shown in thing.sightings]
-    if names:
-        photo = max(sorted(set(names)), key=names.count)
-        camera = scene.file.photo(photo).camera
-        view = scene.render(photo, 2 * max(camera.width, camera.height))
-        save_picture(outlined(scene.splats, answers, view.rendering), path)
+    """Draw numbered outlines on the rendering of `best_photo`."""
+    taken = best_photo(scene, [thing for _, _, thing in numbered(answers)])
+    view = scene.render(taken.name, 2 * max(taken.camera.width, taken.camera.height))
+    save_picture(outlined(scene.splats, answers, view.rendering), path)
 
 
-def write_things(scene: Scene, answers: Sequence[Things], folder: Path, look: str | None = None) -> int:
+def write_things(scene: Scene, answers: Sequence[Things], folder: Path) -> list[Path]:
     """Write a splat file for each thing, named by word and id, and scene.glb with the ids of all as features;
-    return how many things were written."""
-    make_folder(folder)
-    baked, things = scene.baked(look), [thing for _, _, thing in numbered(answers)]
-    write_atomically(folder / "scene.glb", encode_glb(baked, things=things, place=scene.file.georeference))
+    return their paths, the latter's first."""
+    baked, things = scene.baked(), [thing for _, _, thing in numbered(answers)]
+    files = [folder / "scene.glb"]
+    write_atomically(files[0], encode_glb(baked, things=things, place=scene.file.georeference))
     words = dict(zip((one.word for one in answers), slugs([one.word for one in answers]), strict=True))
     for thing in things:
         rows = torch.from_numpy(np.sort(thing.rows)).to(scene.device)
-        write_splats(folder / f"{words[thing.word]}-{thing.id}.ply", baked.select(rows))
-    return len(things)
+        files.append(folder / f"{words[thing.word]}-{thing.id}.ply")
+        write_splats(files[-1], baked.select(rows))
+    return files

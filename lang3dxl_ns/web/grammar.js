@@ -25,8 +25,10 @@ function opened(text, names) {
   const { text: typed, restored } = held(text, names);
   let rest = typed.toLowerCase().replace(/^[ ?!.]+|[ ?!.]+$/g, "").split(/\s+/).filter(Boolean).join(" ");
   const cut = (pattern) => rest !== (rest = rest.replace(pattern, ""));
-  const count = cut(new RegExp(`^(?:${any(language.count)})\\s+`));
+  rest = rest.replace(new RegExp(`(?<=st|nd|rd|th)-(?=(?:${any(grammar.superlatives)}) )`, "g"), " "); // second-highest
   cut(new RegExp(`^(?:${any(language.lead)})\\s+`));
+  rest = plain(rest);
+  const count = cut(new RegExp(`^(?:${any(language.count)})\\s+`));
   cut(new RegExp(` (?:that |which )?(?:are|is)(?: there)?(?= (?:${any(grammar.relations)}) )| (?:${any(grammar.tail)})$`, "g"));
   return { rest, count, restored };
 }
@@ -48,7 +50,7 @@ function request(rest, restored) {
   if (ordered) [asked.nth, rest] = [grammar.ordinals[place] ?? parseInt(place), ordered];
   const [, superlative, noun] = new RegExp(`^(${any(grammar.superlatives)}) (?!of )(.+)$`).exec(rest) ?? [];
   if (noun) [asked.superlative, rest] = [superlative, noun];
-  for (const name of [rest, ...(asked.without === null ? [] : [asked.without])]) checkName(name);
+  for (const name of [rest, ...(asked.without === null ? [] : [asked.without])]) checkName(restored(name) && name); // quotes may hold nothing
   if (asked.nth && !asked.along && !noun) throw new Error(`${place} ${rest}: say from which side, such as the ${place} ${rest} from the left`);
   if (asked.along && (noun || !asked.nth)) throw new Error(`${whole}: say which one, such as the second from the ${asked.along}`);
   return { ...asked, word: restored(rest), without: asked.without && restored(asked.without) };
@@ -81,6 +83,7 @@ export function isQuestion(text, names = [], known = []) {
   }
 }
 
+const orderOf = ({ superlative, along }) => grammar.superlatives[superlative] ?? grammar.from[along] ?? ["", 0];
 const partsOf = (request) => [request, ...request.others.flatMap(partsOf)];
 export const wordsOf = (request) => [...new Set(partsOf(request).flatMap(({ word, without }) => (without ? [word, without] : [word])))];
 
@@ -88,7 +91,7 @@ export const wordsOf = (request) => [...new Set(partsOf(request).flatMap(({ word
  * things that one sees, which alone are numbered from left to right; none: all }. Throws an error if a thing that the relation
  * refers to is not found, or if there are fewer than the ordinal asks for. */
 export function answerTo(request, things, view) {
-  const { word, relation, others, superlative, nth, along, without } = request;
+  const { word, relation, others, nth, without } = request;
   let chosen = things[word], where = "";
   if (without) chosen = chosen.filter(({ id }) => !things[without].some((other) => other.id === id));
   if (relation) {
@@ -96,9 +99,8 @@ export function answerTo(request, things, view) {
     if (missing >= 0) throw new Error(`no ${others[missing].word} found: a relation to it has no answer`);
     chosen = chosen.filter((thing) => related(thing, relation, there, view));
   }
-  const order = grammar.superlatives[superlative] ?? grammar.from[along];
-  if (!order) return chosen;
-  const [kind, sign] = order, place = nth ?? 1;
+  const [kind, sign] = orderOf(request), place = nth ?? 1;
+  if (!sign) return chosen;
   if (kind === "left" && view.shown && chosen.length) [chosen, where] = [chosen.filter(({ id }) => view.shown.has(id)), " in this view"];
   if (chosen.length < place && (nth || where)) throw new Error(`${word}: ${chosen.length ? `only ${chosen.length}` : "none"} found${where}, so there is no number ${place}`);
   return [...chosen].sort((a, b) => sign * (measure(a, kind, view) - measure(b, kind, view))).slice(place - 1, place);
@@ -142,10 +144,13 @@ export function unsure(request, found, view, shown = (word) => word) {
     const { things, candidates } = found[word];
     return (mayLack && word === request.word) || new Set([things, sureOf(things), [...things, ...candidates]].map((some) => told({ [word]: some }))).size > 1;
   });
-  if (wide.length) return wide.map((word) => `${shown(word)}: ${count(found[word])}`).join(", ");
+  const reasons = wide.map((word) => `${shown(word)}: ${count(found[word])}`);
+  const needsUp = (part) => ["above", "below"].includes(part.relation) || ["top", "tall"].includes(orderOf(part)[0]);
+  if (view.upright === false && partsOf(request).some(needsUp)) reasons.push("the photos don't tell which way is up");
+  if (reasons.length) return reasons.join(", ");
   for (const part of plain === null ? [] : partsOf(request)) {
-    const [kind, sign] = grammar.superlatives[part.superlative] ?? ["left", 1];
-    if (kind === "left" || kind === "top") continue;
+    const [kind, sign] = orderOf(part);
+    if (["", "left", "top"].includes(kind)) continue;
     const sizes = answerTo({ ...part, superlative: null, nth: null }, of({}), view).map((thing) => measure(thing, kind, view)).sort((a, b) => sign * (a - b));
     const at = (part.nth ?? 1) - 1, close = (other) => other >= 0 && other < sizes.length && Math.max(sizes[at], sizes[other]) < CLOSE * Math.min(sizes[at], sizes[other]);
     if (close(at - 1) || close(at + 1)) return `another ${shown(part.word)} measures nearly the same`;

@@ -8,6 +8,7 @@ import { advice } from "./vocabulary.js";
 const NAMESPACE = "http://www.w3.org/2000/svg", CORNERS = [0, 1, 2, 3, 4, 5, 6, 7];
 const FILLED = 0.35, NARROW = 15, WIDE = 60; // share of the window that a thing fills after a flight; degrees of the lens
 const MOST_NUMBERS = 8; // of things that are named one by one
+const nameOf = ({ text, negatives }) => [text, ...negatives].join(" not "); // in links: other negatives make another prompt
 const GAP = 4, LETTER = 8, LINE = 18; // pixels between labels, per letter, and of a line
 
 export class List extends EventTarget {
@@ -26,7 +27,7 @@ export class List extends EventTarget {
     if (prompt.turn !== turn || prompt.found === found) return found;
     prompt.found = found;
     this.tidy(prompt);
-    if (this.wanted?.word === prompt.text) this.takeAgain(prompt);
+    if (this.wanted?.word === nameOf(prompt)) this.takeAgain(prompt);
     this.dispatchEvent(new Event("change"));
     return found;
   }
@@ -122,7 +123,7 @@ export class List extends EventTarget {
 
   /** The chosen thing, or the one that will be once its word is answered, as fields of an address, and back. */
   get fields() {
-    const { prompt, thing } = this.chosen ?? {}, { id, word, alone } = thing ? { id: thing.id, word: prompt.text, alone: this.view.only } : this.wanted ?? {};
+    const { prompt, thing } = this.chosen ?? {}, { id, word, alone } = thing ? { id: thing.id, word: nameOf(prompt), alone: this.view.only } : this.wanted ?? {};
     return word ? { thing: `${id} ${word}`, alone: alone ? 1 : "" } : {};
   }
 
@@ -141,18 +142,19 @@ export class List extends EventTarget {
   async question(typed, names, ask) {
     const request = parse(typed, names), words = wordsOf(request), found = {};
     for (const word of words) if (!(await ask(word))) return null;
-    const asked = words.map((word) => this.prompts.find(({ text }) => text.toLowerCase() === word.toLowerCase()));
+    const asked = words.map((word) => this.prompts.find(({ text, negatives }) => text.toLowerCase() === word.toLowerCase() && !negatives.length));
     if (!asked.every(Boolean)) return null;
     for (const [k, word] of words.entries()) found[word] = await this.find(asked[k]);
     const things = Object.fromEntries(words.map((word) => [word, found[word].things])), own = things[request.word];
     const view = await this.sight(Object.values(found)), chosen = answerTo(request, things, view), [first] = asked, every = chosen.length === own.length;
+    const counted = request.count && !(request.relation || request.superlative || request.nth || request.without);
     Object.assign(first, { listed: true, asked: every ? null : new Set(chosen.map(({ id }) => id)) });
     const sure = asked.every(({ trust }) => trust.level === "sure" && !trust.far) ? "" : " Not sure: see the cards.";
-    const doubt = request.count && every ? null : unsure(request, found, view, shown), several = assumed(request, things, view, shown);
+    const doubt = counted ? null : unsure(request, found, view, shown), several = assumed(request, things, view, shown);
     const note = [several && ` ${several}.`, doubt ? ` Unsure, since ${doubt}.` : "", sure, ...words.flatMap(advice).map((told) => ` But ${told}.`)].join("");
     if (request.count) {
       this.dispatchEvent(new Event("change"));
-      return `${shown(request.word)}: ${every ? count(first.found) : chosen.length}.${note}`; // which suits one and many
+      return `${shown(request.word)}: ${counted ? count(first.found) : chosen.length}.${note}`; // which suits one and many
     }
     if (chosen.length) this.choose(first, chosen[0]);
     else this.dispatchEvent(new Event("change"));
@@ -163,10 +165,10 @@ export class List extends EventTarget {
 
   /** Directions of the viewer, right, up and ahead, and the ids of the things that the view shows. */
   async sight(found) {
-    const up = new Vector3(...this.about.up), ahead = this.view.camera.getWorldDirection(new Vector3());
-    ahead.addScaledVector(up, -ahead.dot(up)).normalize();
+    const { upright } = this.about, up = new Vector3(...this.about.up), ahead = this.view.camera.getWorldDirection(new Vector3());
+    ahead.addScaledVector(up, -ahead.dot(up)).normalize(); // which leaves right the picture's, since this camera never rolls
     const shown = new Set((await this.inView(found.map(({ things, candidates }) => [...things, ...candidates]))).map(({ id }) => id));
-    return { right: ahead.clone().cross(up).toArray(), up: up.toArray(), ahead: ahead.toArray(), shown };
+    return { right: ahead.clone().cross(up).toArray(), up: up.toArray(), ahead: ahead.toArray(), shown, upright };
   }
 
   // ── boxes and labels ──

@@ -68,14 +68,9 @@ const photosOf = ({ votes }) => new Set(votes.map(({ view }) => view));
 function described({ rows, weight, votes }, { centers, mass, edges }, weights, relevancy) {
   const shown = new Map(), strength = (i) => mass[i] * (shown.get(i) ?? 0) * relevancy[i] ** 2;
   for (const piece of votes) for (const i of piece.rows) shown.set(i, (shown.get(i) ?? 0) + 1);
-  let id = rows[0], heavy = 0, sum = 0;
-  for (const i of rows) {
-    if (strength(i) > strength(id)) id = i;
-    heavy += Math.max(mass[i], 1e-9);
-    sum += Math.max(mass[i], 1e-9) * relevancy[i];
-  }
+  const id = rows.reduce((best, i) => (strength(i) > strength(best) ? i : best));
   const seen = [...new Set([...votes].sort((a, b) => a.cut - b.cut || b.area - a.area).map(({ view }) => view))];
-  return { id, weight, views: seen.length, score: sum / heavy, rows: Uint32Array.from(rows).sort(), seen, ...uprightBox(rows, centers, weights, edges) };
+  return { id, weight, views: seen.length, rows: Uint32Array.from(rows).sort(), seen, ...uprightBox(rows, centers, weights, edges) };
 }
 
 // ── heat ──

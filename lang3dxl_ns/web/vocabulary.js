@@ -25,7 +25,7 @@ const WHERE = new RegExp(
  * the parts back, without quotes }. */
 export function held(typed, names = []) {
   const parts = [], whole = wholeOf([...language.one, ...names.map(tidy).filter(Boolean)].map(literal)).source;
-  const plain = typed.replace(/‘([^‘’]*)’|[“”„«»]/g, (_, quoted) => (quoted === undefined ? '"' : `"${quoted}"`));
+  const plain = typed.normalize("NFC").replace(/‘([^‘’]*)’|[“”„«»]/g, (_, quoted) => (quoted === undefined ? '"' : `"${quoted}"`));
   const text = plain.replaceAll(HELD, " ").replace(/[\0\s]+/g, " ").trim().replace(new RegExp(`"[^"]*"|${whole}`, "giu"), (part) => HELD + (parts.push(part) - 1) + HELD);
   return { text, restored: (some) => tidy(some.replace(new RegExp(`${HELD}(\\d+)${HELD}`, "g"), (_, i) => parts[i])) };
 }
@@ -34,13 +34,16 @@ export function held(typed, names = []) {
 export function parsePrompts(typed, names = []) {
   const { text, restored } = held(typed, names);
   const listed = (some) => some.split(",").flatMap((piece) => piece.split(whole("and"))).filter((part) => part.trim());
-  return text.split(";")
+  const found = text.split(";")
     .flatMap((part) => {
-      const [wanted, ...others] = part.split(whole("not")), negatives = others.flatMap(listed).map(restored).filter(Boolean);
-      const prompts = listed(wanted), alone = prompts.length || negatives.length ? prompts : [part]; // a separator alone
-      return alone.map((text) => ({ text: restored(text), negatives }));
+      const [wanted, ...others] = part.split(whole("not")), prompts = listed(wanted), negatives = others.flatMap(listed);
+      const alone = prompts.length ? prompts : [negatives.length ? "" : part]; // a separator alone
+      return alone.map((text) => ({ text: restored(text), negatives: negatives.map(restored).filter(Boolean) }));
     })
-    .filter(({ text }) => text);
+    .filter(({ text, negatives }) => text || negatives.length);
+  const alone = found.find(({ text }) => !text);
+  if (alone) throw new Error(`'${alone.negatives[0]}' has only negatives: put what to find first`);
+  return found;
 }
 
 /** Find out what a prompt searches for, and which parts of it the answer does not use, as [kind, part]. */
@@ -116,7 +119,7 @@ export class Vocabulary {
   place(text) {
     const { target, unused } = meaning(text), color = unused.find(([kind]) => kind === "color");
     const plain = color ? tidy(target.replace(color[1], "")) : target;
-    const forms = [text, target, plain, `${plain}s`, plain.replace(/s$/, ""), plain.replace(/es$/, "")];
+    const forms = [text, target, plain, `${plain}s`, ...singulars(plain)];
     return forms.map((form) => this.index.get(form.toLowerCase())).find((place) => place !== undefined);
   }
 
@@ -128,7 +131,7 @@ export class Vocabulary {
 
   /** List the places of the common words that a prompt has, in singular or plural: *dark windows* has *window*. */
   commonIn(text) {
-    const { target } = meaning(text), forms = target.toLowerCase().split(" ").flatMap((word) => [word, ...["s", "es"].map((end) => word.replace(new RegExp(`${end}$`), ""))]);
+    const { target } = meaning(text), forms = target.toLowerCase().split(" ").flatMap(singulars);
     return [...Array(this.common).keys()].filter((i) => this.words[i].split(" ").every((word) => forms.includes(word)));
   }
 
@@ -158,6 +161,12 @@ export class Vocabulary {
   get listed() {
     return [...new Set([...Object.keys(this.taught).map((i) => this.words[i]), ...this.words])];
   }
+}
+
+/** List a word or term without punctuation, and those that it may be the plural of, as Python's `singulars`. */
+function singulars(words) {
+  const word = words.replace(/^[.,;:!?'"()]+|[.,;:!?'"()]+$/g, "");
+  return [word, ...language.plurals.filter(([plural]) => word.endsWith(plural)).map(([plural, one]) => word.slice(0, -plural.length) + one)];
 }
 
 function pluralOf(word) {

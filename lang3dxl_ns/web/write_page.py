@@ -156,6 +156,7 @@ class Page:
             "antialiased": scene.splats.antialiased,
             "background": [0, 0, 0] if scene.background is None else scene.background.tolist(),
             "up": find.up_of(scene).tolist(),
+            "upright": find.is_upright(scene),
             "edges": find.axes_of(scene).tolist(),
             "heights": find.heights_of(scene).tolist(),
             "extent": extent(scene),

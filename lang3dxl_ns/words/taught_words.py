@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+from unicodedata import normalize
 
 import numpy as np
 import torch
@@ -214,8 +215,8 @@ class TaughtWord:
 
 
 def known_word(text: str) -> str:
-    """Return the form in which words are compared: lower case, with single spaces."""
-    return " ".join(text.lower().split())
+    """Return the form in which words are compared: lower case, single spaces, accents in letters."""
+    return " ".join(normalize("NFC", text).lower().split())
 
 
 def words_from_json(content: Sequence[Any]) -> list[TaughtWord]:

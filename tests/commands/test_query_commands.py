@@ -33,14 +33,16 @@ def test_labels_are_written_to_a_json_file_alone(run, tmp_path, name):
     assert (tmp_path / "wall.scene").read_text() == "a scene" and not (tmp_path / "o").exists()
 
 
-def test_labels_replace_labels_alone(run, tmp_path):
+def test_labels_replace_own_labels_alone(run, tmp_path):
+    drawn = '{"info": {"description": "by hand"}, "images": [], "annotations": []}'
     words = ("query", "c", "--text", "dome", "--all", "--out", tmp_path / "o", "--coco", tmp_path / "a.json")
-    for content in ('{"name": "my package"}', "[]", "no JSON"):
+    for content in ('{"name": "my package"}', "[]", "no JSON", drawn):
         (tmp_path / "a.json").write_text(content)
-        with pytest.raises(SystemExit, match="is another file than one of labels"):
+        with pytest.raises(SystemExit, match="would be replaced, and is not ours"):
             run(*words)
         assert (tmp_path / "a.json").read_text() == content
-    (tmp_path / "a.json").write_text('{"images": [], "annotations": []}')
+    (tmp_path / "a.json").unlink()
+    run(*words)
     run(*words)
     assert len(json.loads((tmp_path / "a.json").read_text())["images"]) == len(painted_scene().photos)
 

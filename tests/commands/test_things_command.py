@@ -6,6 +6,7 @@ import json
 import pytest
 from painted_scene import painted_scene
 
+from lang3dxl_ns.commands.evaluate import EvaluateThings
 from lang3dxl_ns.commands.things import ListThings
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.words.taught_words import Example
@@ -32,6 +33,7 @@ def test_a_count_is_a_number_and_a_list_names_what_it_lists_and_where_it_is_seen
 
 def test_what_an_answer_does_not_use_is_told(ask):
     assert "red is likely to be ignored" in " ".join(ask(text=["red windows"]))
+    assert "counting" not in " ".join(ask(text=["how many windows"]))
     with pytest.raises(UserError, match="near"):
         ask("windows near the dome")
 
@@ -51,6 +53,40 @@ def test_a_question_without_an_answer_does_not_end_those_that_have_one(ask, tmp_
     assert "windows above the gate" in ask("windows above the gate", text=["windows"])[-1]
     with pytest.raises(UserError, match="no gate found"):
         ask("windows above the gate")
+
+
+@pytest.mark.parametrize("name", ["things.json", "instances.json"])
+def test_what_a_person_drew_is_not_replaced(monkeypatch, tmp_path, name):
+    monkeypatch.setattr("lang3dxl_ns.open_scene.load_scene", lambda *which, **how: pytest.fail("loaded"))
+    drawn = '{"info": {"description": "by hand"}, "images": [], "annotations": []}'
+    (tmp_path / name).write_text(drawn)
+    with pytest.raises(UserError, match=rf"{name} would be replaced"):
+        ListThings(text=["windows"], out=tmp_path).main()
+    assert [path.read_text() for path in tmp_path.iterdir()] == [drawn]
+
+
+def test_a_call_replaces_the_files_of_an_earlier_one_and_names_what_it_leaves(ask, tmp_path):
+    ask(text=["windows"], out=tmp_path, splats=True)
+    files = {path: path.read_bytes() for path in tmp_path.iterdir() if path.is_file()}
+    old = {path.name for path in (tmp_path / "splats").glob("*.ply")}
+    EvaluateThings(coco=tmp_path / "instances.json", out=tmp_path).main()
+    assert len(files) == 4 and all(path.read_bytes() == content for path, content in files.items())
+    told = ask(text=["flamingo"], out=tmp_path)[-1]
+    assert "has files that are not of this call" in told and all(name in told for name in old)
+    assert not any(path.read_bytes() == content for path, content in files.items())
+    assert "not of this call" not in " ".join(ask(text=["windows"], out=tmp_path, splats=True))
+
+
+def test_a_word_with_negatives_is_not_the_word_alone(ask, tmp_path):
+    texts = ['"windows" not "window"', "windows not domes"]
+    assert ask("how many windows", text=texts, out=tmp_path, splats=True)[0].startswith(
+        texts[0].replace('"', "")
+    )
+    catalog = json.loads((tmp_path / "things.json").read_text())
+    counts = {"windows not window": 0, "windows not domes": 2, "windows": 2}
+    assert {one["word"]: one["count"] for one in catalog["words"]} == counts
+    assert {one["word"] for one in catalog["things"]} == {"windows not domes"}  # each thing once
+    assert len([*(tmp_path / "splats").glob("windows-not-domes-*.ply")]) == 2
 
 
 def test_quotes_and_taught_names_hold_a_phrase(ask, monkeypatch):

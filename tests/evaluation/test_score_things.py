@@ -2,9 +2,11 @@
 
 import json
 import os
+from dataclasses import replace
 
+import numpy as np
 import pytest
-from painted_scene import painted_scene
+from painted_scene import painted_file, painted_scene
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.evaluation.score_things import score_things
@@ -86,6 +88,37 @@ def test_labels_of_lerf_ovs_score_as_the_same_boxes_in_coco(tmp_path):
     assert [score[:3] for score in scores] == [score[:3] for score in score_things(scene, file)]
     with pytest.raises(UserError, match=r"labels\.json can't be used"):
         score_things(scene, tmp_path)
+
+
+@pytest.mark.parametrize("turns", [0, 1])
+def test_boxes_drawn_on_files_are_found_in_undistorted_photos(tmp_path, turns):
+    plain, file, bend = painted_file(), tmp_path / "labels.json", 0.0 if turns else -0.3
+    lenses = [
+        replace(photo.lens, width=128, cx=64.0, distortion=(bend, 0.0, 0.0, 0.0)) for photo in plain.photos
+    ]
+    photos = [
+        replace(photo, lens=lens, quarter_turns=turns)
+        for photo, lens in zip(plain.photos, lenses, strict=True)
+    ]
+    scene = painted_scene(file=replace(plain, photos=photos))
+    content = coco(scene, scene.things("windows"))
+    count = len(content["annotations"])
+    file.write_text(json.dumps(content))
+    assert score_things(scene, file) == [("windows", count, count, 0, 1.0)]  # ours are undistorted
+    for label in content["annotations"]:
+        lens, (x, y, wide, high) = lenses[label["image_id"] - 1], label["bbox"]
+        if turns:  # the file lies on its side
+            label["bbox"] = [y, lens.width - x - wide, high, wide]
+            continue
+        corners = np.array([(a, b) for a in (x, x + wide) for b in (y, y + high)])
+        seen = (corners - (lens.cx, lens.cy)) / (lens.fx, lens.fy)
+        seen *= 1 + bend * (seen**2).sum(1, keepdims=True)
+        low, high = (end(seen * (lens.fx, lens.fy) + (lens.cx, lens.cy), axis=0) for end in (np.min, np.max))
+        label["bbox"] = [*low.tolist(), *(high - low).tolist()]
+    for image in content["images"] if turns else ():
+        image["width"], image["height"] = image["height"], image["width"]
+    file.write_text(json.dumps(content | {"info": {"description": "by hand"}}))
+    assert score_things(scene, file) == [("windows", count, count, 0, 1.0)]
 
 
 FLAT = {

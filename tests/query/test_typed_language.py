@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from lang3dxl_ns import web
+from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.query.language import TABLE, meaning
 from lang3dxl_ns.query.text import caution, parse_prompts, taught_prompt
 from lang3dxl_ns.query.vocabulary import closest_word, common_words, shipped_vocabulary
@@ -16,10 +17,13 @@ from lang3dxl_ns.web.write_page import language_module
 READ = """
 import { meaning, parsePrompts } from "./vocabulary.js";
 import cases from "./cases.js";
-console.log(JSON.stringify(cases.map((case_) => parsePrompts(...case_).map(({ text, negatives }) => {
+const read = (case_) => parsePrompts(...case_).map(({ text, negatives }) => {
   const { target, unused } = meaning(text);
   return [text, negatives, target, unused.map(([kind]) => kind)];
-}))));
+});
+console.log(JSON.stringify(cases.map((case_) => {
+  try { return read(case_); } catch (error) { return error.message; }
+})));
 """
 
 
@@ -33,9 +37,12 @@ NAMED = {
 }
 
 
-def read(typed: str, names=()) -> list:
-    """What Python makes of a text, in the form of the table's cases."""
-    meanings = [(prompt, meaning(prompt.text)) for prompt in parse_prompts(typed, names)]
+def read(typed: str, names=()) -> list | str:
+    """What Python makes of a text, in the form of the table's cases, or says against it."""
+    try:
+        meanings = [(prompt, meaning(prompt.text)) for prompt in parse_prompts(typed, names)]
+    except UserError as error:
+        return str(error)
     return [[p.text, list(p.negatives), m.target, [kind for kind, _ in m.unused]] for p, m in meanings]
 
 
@@ -56,6 +63,7 @@ def test_the_page_reads_the_same(tmp_path):
         shutil.copy(path, tmp_path)
     (tmp_path / "language.js").write_bytes(language_module())
     typed = [(case[0], ()) for case in TABLE["cases"]] + [(word, ()) for word in common_words()]
+    typed += [("not doors", ()), ("windows; without “arches”, doors", ())]  # only negatives
     typed += [(text, NAMES) for text in (*NAMED, *(case[0] for case in TABLE["cases"]))]
     (tmp_path / "cases.js").write_text(f"export default {json.dumps(typed)};")
     (tmp_path / "package.json").write_text('{"type": "module"}')

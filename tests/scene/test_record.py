@@ -1,7 +1,8 @@
 """The scene description in a run's folder."""
 
 import json
-from dataclasses import asdict
+from dataclasses import asdict, replace
+from unicodedata import normalize
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from lang3dxl_ns.scene.photo import Photo, turned_lens
 from lang3dxl_ns.scene.reconstruction import REPORT, ReconstructionReport, doubtful_photos
 from lang3dxl_ns.scene.record import ScenePhoto, SceneRecord
 from lang3dxl_ns.words.learn_word import _marks
-from lang3dxl_ns.words.taught_words import Example
+from lang3dxl_ns.words.taught_words import Example, known_word
 
 
 @pytest.fixture
@@ -83,6 +84,14 @@ def test_a_missing_file_is_explained(tmp_path):
 @pytest.mark.parametrize("name", ["left/0001.jpg", "0001.jpg", "0001"])
 def test_a_photo_goes_by_its_name_file_name_or_stem(file, name):
     assert file.photo(name).name == "left/0001.jpg"
+
+
+@pytest.mark.parametrize(("stored", "typed"), [("NFC", "NFD"), ("NFD", "NFC")])
+def test_an_accent_is_the_same_in_its_letter_or_behind_it(file, stored, typed):
+    own, asked = (normalize(form, "left/façade.jpg") for form in (stored, typed))
+    named = replace(file, photos=[replace(file.photos[0], name=own), *file.photos[1:]])
+    assert own != asked and named.photo(asked).name == named.photo(asked.split("/")[1]).name == own
+    assert known_word(own) == known_word(asked)
 
 
 def test_a_resized_camera_sees_the_same(file):

@@ -2,12 +2,14 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from made_things import SIGHT, thing
 from painted_scene import painted_file, painted_scene
 
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.things.find import Things
+from lang3dxl_ns.scene.georeference import Georeference
+from lang3dxl_ns.things.find import Things, is_upright
 from lang3dxl_ns.things.grammar import Request, Sight, answer, assumed, meant, parse, sight_of, table, unsure
 
 
@@ -38,6 +40,16 @@ from lang3dxl_ns.things.grammar import Request, Sight, answer, assumed, meant, p
             Request("windows", relation="above", others=(Request("door", nth=2, along="left"),)),
         ),
         ("second highest tower", Request("tower", superlative="highest", nth=2)),
+        ("the second-highest tower", Request("tower", superlative="highest", nth=2)),
+        ("left-most tower", Request("tower", superlative="left-most")),
+        ("first-floor windows", Request("first-floor windows")),
+        ("twelfth window from the left", Request("window", nth=12, along="left")),
+        ("what is the number of windows", Request("windows", count=True)),
+        ("the number of the windows", Request("windows", count=True)),
+        (
+            "how many of the windows are above the dome",
+            Request("windows", True, relation="above", others=(Request("dome"),)),
+        ),
         ("3rd window from left", Request("window", nth=3, along="left")),
         ('how many "Statue on the roof"', Request("Statue on the roof", count=True)),
         ("how many “doors and gates” not 'a' door", Request("doors and gates", True, without="'a' door")),
@@ -66,6 +78,7 @@ def test_taught_names_and_quotes_hold_a_phrase(typed):
         *("tallest two towers", "top window", "gate 3", "0th window from the left", "doors, towers"),
         *("third window from the left side", "windows; doors", "two windows above the portal"),
         *("second highest tower from the left", "windows on the right", "leftmost window from the right"),
+        *("windows directly above the dome", 'how many ""', 'windows above ""', 'windows not " "'),
     ],
 )
 def test_what_the_grammar_does_not_know_is_said(text):
@@ -154,6 +167,54 @@ def test_left_and_right_in_a_photo_are_told_among_what_it_shows():
     assert sight_of(scene, nowhere, first.name).shown == {one.id for one in windows}
     assert sight_of(scene, windows, away.name).shown == frozenset()
     assert sight_of(scene, windows).shown is None
+
+
+def sight_in(*pose) -> Sight:
+    """Who looks at the painted wall in a photo with these axes (x, y, backward), where gravity tells up."""
+    plain = painted_file()
+    x, y, back = np.array(plain.photos[0].camera_to_world).T[:3]
+    up = Georeference(1.0, tuple(y.tolist()), tuple(-back), 0.1, 3)
+    pose = np.column_stack([*(np.array(axis) @ [x, y, back] for axis in pose), back]).tolist()
+    photo = replace(plain.photos[0], name="new.jpg", camera_to_world=pose)
+    scene = painted_scene(file=replace(plain, photos=[*plain.photos, photo], georeference=up))
+    sight = sight_of(scene, [], photo.name)
+    return replace(sight, **{name: [x, y, back] @ getattr(sight, name) for name in ("right", "up", "ahead")})
+
+
+@pytest.mark.parametrize("tilt", [-20, -1, 0, 1, 20, 89])
+def test_a_photo_from_above_has_the_right_of_its_picture(tilt):
+    """Whether it looks down a little before or behind the vertical."""
+    sin, cos = np.sin(np.radians(tilt)), np.cos(np.radians(tilt))
+    sight = sight_in((1, 0, 0), (0, sin, -cos), (0, cos, sin))
+    np.testing.assert_allclose(
+        [sight.right, sight.up, sight.ahead], [(1, 0, 0), (0, 1, 0), (0, 0, -1)], atol=1e-6
+    )
+
+
+def test_a_picture_on_its_side_has_the_right_of_whoever_took_it():
+    sight = sight_in((0, 1, 0), (-1, 0, 0), (0, 0, 1))
+    np.testing.assert_allclose([sight.right, sight.ahead], [(1, 0, 0), (0, 0, -1)], atol=1e-6)
+
+
+def test_heights_are_doubted_where_cameras_do_not_tell_which_way_is_up():
+    scene = painted_scene()
+    assert is_upright(scene)
+    turned = [
+        replace(
+            one, name=f"t{one.name}", camera_to_world=[[-x, -y, *rest] for x, y, *rest in one.camera_to_world]
+        )
+        for one in scene.photos
+    ]
+    assert not is_upright(painted_scene(file=replace(scene.file, photos=[*scene.photos, *turned])))
+    found = [
+        Things(word, [thing(i, word, (0, 0, 2 * i), views=9)]) for i, word in enumerate(("window", "dome"))
+    ]
+    lost = replace(SIGHT, upright=False)
+    for text in ("highest window", "window below the dome", "first window from the top", "tallest dome"):
+        assert "which way is up" in unsure(parse(text), found, lambda _: lost)
+        assert unsure(parse(text), found, lambda _: SIGHT) is None
+    for text in ("leftmost window", "largest window", "window next to the dome"):
+        assert unsure(parse(text), found, lambda _: lost) is None
 
 
 def test_a_relation_to_several_things_tells_that_any_counts():

