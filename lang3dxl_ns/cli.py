@@ -111,6 +111,8 @@ def main(arguments: list[str] | None = None) -> None:
 _TEXTS = "Texts follow --text: lang3dxl {} RUN --text windows{}"
 _PLACES = (".scene", ".glb", ".spz", ".yml", ".ply", ".sog", ".splat", ".pt", ".ckpt")
 """Endings of what holds a scene or a splat."""
+_REPEATED = ("--text", "--ask", "--not", "--segment", "--forget")
+"""Options that take one text each time."""
 
 
 def _parsed(words: Sequence[str]) -> Any:
@@ -132,18 +134,19 @@ def _parsed(words: Sequence[str]) -> Any:
 
 
 def with_all_texts(words: Sequence[str]) -> list[str]:
-    """Repeat --text before each further text, as people write `--text windows doors`. What names a file or
-    folder is the scene and stays as it is. Raises UserError for what is written like one and is not there."""
-    given, value, texts = [], False, False
+    """Repeat --text, or another option of `_REPEATED`, before each further text, as people write `--text
+    windows doors`. What names a file or folder is the scene and stays as it is. Raises UserError for what is
+    written like one and is not there."""
+    given, value, option = [], False, ""
     for word in words:
         if word.startswith("-"):
-            value = texts = word == "--text"
+            value, option = word in _REPEATED, word
         elif value:
             value = False
-        elif texts and not Path(word).exists():
+        elif option in _REPEATED and not Path(word).exists():
             if "/" in word or Path(word).suffix.lower() in _PLACES:
-                raise UserError(f"{word} does not exist: correct the name, or write --text before a text")
-            given.append("--text")
+                raise UserError(f"{word} does not exist: correct the name, or write {option} before a text")
+            given.append(option)
         given.append(word)
     return given
 

@@ -82,10 +82,11 @@ def test_a_text_without_its_flag_is_told(capsys):
     assert "Texts follow --text" in capsys.readouterr().err
 
 
-def test_several_texts_may_follow_their_flag_and_the_scene_too(tmp_path):
+@pytest.mark.parametrize("flag", ["--text", "--ask", "--not"])
+def test_several_texts_may_follow_their_flag_and_the_scene_too(flag, tmp_path):
     scene = str(tmp_path)
-    assert cli.with_all_texts(["query", "--text", "windows", "red roof", scene, "--out", "x"]) == (
-        ["query", "--text", "windows", "--text", "red roof", scene, "--out", "x"]
+    assert cli.with_all_texts(["query", flag, "windows", "red roof", scene, "--out", "x"]) == (
+        ["query", flag, "windows", flag, "red roof", scene, "--out", "x"]
     )
     assert cli.with_all_texts(["query", scene, "--text", scene]) == ["query", scene, "--text", scene]
     assert cli.with_all_texts(["teach", scene, "--text=a", "b"]) == ["teach", scene, "--text=a", "b"]
