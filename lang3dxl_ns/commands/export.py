@@ -22,6 +22,7 @@ from lang3dxl_ns.query.question import QueryConfig
 from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.query.text import Prompt
 from lang3dxl_ns.query.vocabulary import whole_words
+from lang3dxl_ns.scene.photo_folder import find_photos
 from lang3dxl_ns.web.video import RATE, tour_shots, write_video
 from lang3dxl_ns.web.write_page import Page, write_page
 
@@ -50,7 +51,7 @@ class Export(OfScene):
     video: Path | None = None
     """Video to write, such as out.mp4, of the tour that the page kept in the scene's file (needs ffmpeg)."""
     things: bool = False
-    """Draw numbered boxes of the things that the tour's words name, in place of heat."""
+    """With --video: draw numbered boxes of the things that the tour's words name, in place of heat."""
     vocabulary: Path | None = None
     """File of more words that may name a place on the page, one per line."""
     photos: Path | None = None
@@ -77,6 +78,8 @@ class Export(OfScene):
     def main(self) -> None:
         target = self._target()
         prompts = parse_texts(self.text, self.not_)
+        if self.photos is not None:
+            find_photos(self.photos)  # fail now rather than after the work
         if self.scene_file is not None:
             check_scene_name(self.scene_file)
         if self.out is not None:
@@ -101,8 +104,9 @@ class Export(OfScene):
             raise UserError("--not is a negative of texts: give --text too, or leave it off")
         if self.index is not None and (self.out is None or not self.text):
             raise UserError("--index lists the Gaussians that match: give --text and --out with it")
-        if self.settings != QueryConfig() and not self.text and self.web is None:
-            raise UserError("settings of queries have no effect without --text: leave them off, or give one")
+        if self.settings != QueryConfig() and not self.text and targets[0] in ("out", "scene_file"):
+            give = ", or give one" * (targets[0] in _READ_BY["text"])
+            raise UserError(f"settings of queries have no effect without --text: leave them off{give}")
         return targets[0]
 
     def _splat(self, path: Path, scene: Scene, prompts: list[Prompt]) -> None:
