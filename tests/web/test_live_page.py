@@ -91,9 +91,9 @@ def marks_of(name, *examples):
 
 
 def test_marks_are_kept_once_and_forgotten_after_a_refusal_and_another_server(file):
-    more = CLICK | {"points": [*CLICK["points"], [70, 70]]}
+    other, more = (CLICK | {"points": points} for points in ([[70, 70]], [[70, 70], [71, 71]]))
     with live(file) as server:
-        for marks, status in ((CLICK, 200), (CLICK | {"points": [[690, 69]]}, 400), (CLICK, 200)):
+        for marks, status in ((CLICK, 200), (CLICK | {"points": [[690, 69]]}, 400), (other, 200)):
             assert posted(server, marks_of("cupola", marks))[0] == status
             assert len(in_file(file)["cupola"]["examples"]) == 1
     with live(file) as server:
