@@ -147,9 +147,7 @@ class Handler(BaseHTTPRequestHandler):
         for name, value in {**_HEADERS, **headers, "Content-Length": str(len(content))}.items():
             self.send_header(name, value)
         self.end_headers()
-        for start in range(
-            0, len(content), _PART
-        ):  # the patience is each part's, however slow the connection
+        for start in range(0, len(content), _PART):  # each has the whole patience
             self.wfile.write(content[start : start + _PART])
 
     def log_message(self, *_: object) -> None:

@@ -352,9 +352,7 @@ class Page:
         tour, ours = self.own_words.keep_tour(content, self.provenance.tour)
         self.provenance = replace(self.provenance, tour=tour)
         if not ours:
-            raise UserError(
-                "another tab kept another one: open the page again, without what follows # in its address"
-            )
+            raise UserError("another tab kept another one: open the page again, without # and what follows")
 
     def photo(self, name: str) -> bytes:
         """Read a small copy of a photo. Raises UserError if there is none."""
