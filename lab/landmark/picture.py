@@ -10,9 +10,10 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from numpy import ndarray as Array
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image, ImageDraw
 from scipy.ndimage import binary_erosion
 
+from lang3dxl_ns.common.captions import letters
 from lang3dxl_ns.evaluation.scores import resize_map
 from lang3dxl_ns.query.heat_maps import overlay
 from lang3dxl_ns.query.match import Match
@@ -61,7 +62,7 @@ def draw_picture(rows: Sequence[PictureRow], path: Path) -> None:
     lines = [_cells(row) for row in rows]
     height = max(_scaled_height(image) for cells in lines for _, image in cells)
     canvas = Image.new("RGB", (max(map(len, lines)) * WIDTH, len(lines) * (height + _LINE) + _LINE), "white")
-    pen, font = ImageDraw.Draw(canvas), ImageFont.load_default(_LINE * 0.6)
+    pen, font = ImageDraw.Draw(canvas), letters(_LINE * 0.6)
     for y, cells in enumerate(lines):
         for x, (title, image) in enumerate(cells):
             left, top = x * WIDTH, y * (height + _LINE)

@@ -22,6 +22,7 @@ from lang3dxl_ns.query.question import QueryConfig
 from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.query.text import Prompt
 from lang3dxl_ns.query.vocabulary import whole_words
+from lang3dxl_ns.scene.photo_folder import find_photos
 from lang3dxl_ns.web.video import RATE, tour_shots, write_video
 from lang3dxl_ns.web.write_page import Page, write_page
 
@@ -50,7 +51,7 @@ class Export(OfScene):
     video: Path | None = None
     """Video to write, such as out.mp4, of the tour that the page kept in the scene's file (needs ffmpeg)."""
     things: bool = False
-    """Draw numbered boxes of the things that the tour's words name, in place of heat."""
+    """With --video: draw numbered boxes of the things that the tour's words name, in place of heat."""
     vocabulary: Path | None = None
     """File of more words that may name a place on the page, one per line."""
     photos: Path | None = None
@@ -77,6 +78,8 @@ class Export(OfScene):
     def main(self) -> None:
         target = self._target()
         prompts = parse_texts(self.text, self.not_)
+        if self.photos is not None:
+            find_photos(self.photos)  # fail now rather than after the work
         if self.scene_file is not None:
             check_scene_name(self.scene_file)
         if self.out is not None:
@@ -105,8 +108,9 @@ class Export(OfScene):
             raise UserError(
                 f"{self.out.name} can't hold relevancies: write a .ply, or leave --text or --all off"
             )
-        if self.settings != QueryConfig() and not self.text and self.web is None:
-            raise UserError("settings of queries have no effect without --text: leave them off, or give one")
+        if self.settings != QueryConfig() and not self.text and targets[0] in ("out", "scene_file"):
+            give = ", or give one" * (targets[0] in _READ_BY["text"])
+            raise UserError(f"settings of queries have no effect without --text: leave them off{give}")
         if self.settings.size is not None:
             raise UserError("--size is that of pictures, of which export writes none: leave it off")
         return targets[0]

@@ -42,12 +42,17 @@ class View(OfScene):
 
     def main(self) -> None:
         from lang3dxl_ns.open_scene import find_scene_file, load_scene, provenance_of
+        from lang3dxl_ns.scene.photo_folder import find_photos
         from lang3dxl_ns.web.photos import folder_of_run
         from lang3dxl_ns.web.serve import PageServer
         from lang3dxl_ns.web.teach import PageWords
         from lang3dxl_ns.web.write_page import Page
 
         check_address(self.host, self.port)  # fail now rather than after the work
+        if self.photos is not None:
+            find_photos(self.photos)
+        if self.tour and self.text:
+            raise UserError("--tour shows the words of its stops, in place of --text: leave one off")
         file, told = find_scene_file(self.scene), provenance_of(self.scene)
         if self.tour and not told.tour:
             raise UserError("the scene's file has no tour: keep views in the page (Tour, Keep this view)")

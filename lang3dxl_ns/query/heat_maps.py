@@ -10,8 +10,10 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int64, UInt8
 from numpy import ndarray as Array
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image, ImageDraw
 from torch import Tensor
+
+from lang3dxl_ns.common.captions import letters, lines
 
 _OPACITY = 0.7
 """Opacity of the heat over a pixel that matches."""
@@ -75,15 +77,18 @@ def tinted(
 
 
 def with_legend(picture: UInt8[Array, "h w 3"], labels: Sequence[str]) -> UInt8[Array, "h+legend w 3"]:
-    """Add a line for each prompt below a picture: a square of its color, and its label."""
+    """Add lines for each prompt below a picture: a square of its color, and its label."""
     height, width = picture.shape[:2]
     size = max(width // _FONT_SHARE, 11)
-    line = size + size // 2
-    canvas = Image.new("RGB", (width, height + line * len(labels)), "white")
+    line, font = size + size // 2, letters(size)
+    texts = [lines(label, font, max(width - 3 * size, size)).split("\n") for label in labels]
+    canvas = Image.new("RGB", (width, height + line * sum(map(len, texts))), "white")
     canvas.paste(Image.fromarray(picture))
-    pen, font = ImageDraw.Draw(canvas), ImageFont.load_default(size)
-    for i, label in enumerate(labels):
-        left, top = size // 2, height + i * line + (line - size) // 2
+    pen, top = ImageDraw.Draw(canvas), height + (line - size) // 2
+    for i, text in enumerate(texts):
+        left = size // 2
         pen.rectangle((left, top, left + size, top + size), fill=PROMPT_COLORS[i % len(PROMPT_COLORS)])
-        pen.text((2 * size, top + size / 2), " ".join(label.split()), "black", font, anchor="lm")
+        for part in text:
+            pen.text((2 * size, top + size / 2), part, "black", font, anchor="lm")
+            top += line
     return np.asarray(canvas)

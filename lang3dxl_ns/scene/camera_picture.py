@@ -7,8 +7,9 @@ from collections.abc import Collection, Sequence
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray as Array
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image, ImageDraw
 
+from lang3dxl_ns.common.captions import letters
 from lang3dxl_ns.common.errors import printable
 from lang3dxl_ns.scene.frame import COLMAP_UP, find_frame
 
@@ -46,7 +47,7 @@ def camera_picture(
     pyramids = centers[:, None] + size * (turned @ _PYRAMID.T).transpose(0, 2, 1)
     red = [name in doubtful for name in names]
     canvas = Image.new("RGB", (2 * _PANEL, _PANEL), _WHITE)
-    pen, font = ImageDraw.Draw(canvas), ImageFont.load_default(_LETTERS)
+    pen, font = ImageDraw.Draw(canvas), letters(_LETTERS)
     for panel, title in enumerate(("from above", "from the side")):
         pen.point(_pixels(dots, middle, reach, panel), fill=_GRAY)
         for i in sorted(range(len(names)), key=red.__getitem__):  # red on top

@@ -19,6 +19,7 @@ from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from lang3dxl_ns.common.checks import FARTHEST
 from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.query.visibility import VisibleGaussians
 from lang3dxl_ns.rendering import Splats
@@ -74,7 +75,9 @@ def levels_of(scene: Scene, most: int = MOST_ROWS) -> Levels:
     while count > most * _FAN**depth:
         depth += 1
     rows = -(-count // (_FAN**depth * _ALIGNED)) * _ALIGNED
-    sound, splats = scene.splats.sound(), scene.splats
+    splats = scene.splats
+    near = (splats.means.abs() < FARTHEST).all(1) & (splats.scales < FARTHEST).all(1)  # squares stay finite
+    sound = splats.sound() & near
     if scene.looks is None:  # looks change harmonics
         splats = replace(splats, harmonics=harmonics_of(splats.colors(scene.overview.camera.position)))
     filled = torch.arange(rows * _FAN**depth, device=splats.means.device).clamp_max(count - 1)
@@ -82,7 +85,8 @@ def levels_of(scene: Scene, most: int = MOST_ROWS) -> Levels:
     visible = sound[filled] & (torch.arange(len(filled), device=filled.device) < count)
     means = torch.where(visible[:, None], splats.means, splats.means[visible].median(0).values)
     quats = torch.where(visible[:, None], splats.quats, splats.quats.new_tensor([1.0, 0, 0, 0]))
-    splats = replace(splats, means=means, quats=quats, opacities=splats.opacities * visible)
+    scales, opacities = splats.scales * visible[:, None], splats.opacities * visible
+    splats = replace(splats, means=means, quats=quats, scales=scales, opacities=opacities)
     order = tree_order(splats, _meaning(scene)[filled])
     splats, origin = splats.select(order), filled[order]
     codes = None if scene.codes is None else torch.where(visible[order, None], scene.codes[origin], torch.nan)

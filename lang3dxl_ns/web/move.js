@@ -3,6 +3,7 @@ import { OrbitControls, PerspectiveCamera, Vector3 } from "./library.js";
 import { isFree } from "./space.js";
 
 const FLIGHT = 1200, WIDEST = 110, ROOM = 8; // milliseconds, degrees of a lens, pixels between a landmark and buttons
+const STANDS = 1e-4; // share of the distance to the target within which an eye only turns: links have five digits
 const TURN = 0.1, TAP = 0.1, NEARER = 0.1, PACE = 0.25; // radians, seconds and share of the distance of a key press; share of the overview's depth walked in a second
 const LOOK = 0.003, WHEEL = 0.001, STEEPEST = 1.5; // radians per pixel, seconds per unit of the wheel, radians
 const WAYS = { w: [0, 0, 1], s: [0, 0, -1], a: [-1, 0, 0], d: [1, 0, 0], q: [0, -1, 0], e: [0, 1, 0] }; // right, up, ahead
@@ -141,8 +142,8 @@ export class Mover extends EventTarget {
     if (time === 1) this.flight = null;
     if (time === 1) return this.place(to);
     const fov = from.fov + (to.fov - from.fov) * eased;
-    if (from.position.distanceTo(to.position) === 0) return this.place({ position: from.position, target, fov });
     const [here, there] = [from, to].map((stand) => stand.position.clone().sub(stand.target));
+    if (from.position.distanceTo(to.position) < STANDS * here.length()) return this.place({ position: from.position, target, fov });
     const distance = here.length() ** (1 - eased) * there.length() ** eased;
     const offset = here.normalize().lerp(there.normalize(), eased).normalize().multiplyScalar(distance);
     this.place({ position: target.clone().add(offset), target, fov });

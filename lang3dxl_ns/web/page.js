@@ -17,7 +17,7 @@ const MIDDLE = /^(what('s| is| am i looking at)( this| that| it| here| there)?|w
 const MOST_TRIED = 6, TIE = 0.02, HALF = "50"; // suggested words; relevancies that tell words apart; how many floaters a page hides at first
 const prompts = [], taughtHere = new Set(); // names that were taught to the server's scene from here
 let about, view, photos, list, tour, steps, kept, settled = false, cleared = 0; // settled: the address has been read; cleared: how often all prompts were removed
-let ends = [], outlining = null, chosenLook = "";
+let ends = [], outlining = null, chosenLook = "", keeping = Promise.resolve(); // keeping: of the tour, one after another
 
 const think = thinker(
   (done) => say(`Reading what the scene means: ${percent(done)}`),
@@ -99,6 +99,7 @@ async function ask(typed, turn = cleared) {
     draw(settled ? card : null);
     if (found.meant && found.trust.level !== "sure") offerMeant(found.meant, card);
   }
+  if (about.words && !found && turn === cleared && tidy(String(typed))) say("Put what to find first: windows not doors.");
   const { known = false, doubtful = true, threshold = null, peak = 0, matching = 0 } = found ?? {};
   return { known, doubtful, threshold, peak, matching };
 }
@@ -319,13 +320,31 @@ async function outline(prompt) {
   if (found) await attempt(() => addMark(prompt, inside(found), prompt.without, found));
 }
 
-const post = (path, content) => request(path, { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(content) });
+/** Post to the live server: resolves to whether it did what was asked, and to what it says. */
+async function post(path, content) {
+  try {
+    const answered = await request(path, { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(content) });
+    return { done: answered.ok, told: await answered.text() };
+  } catch (error) {
+    return { done: false, told: error.message };
+  }
+}
 
-/** Keep the tour in the address and, behind a live page, in the scene's file. */
+/** Keep the tour in the scene's file behind a live page, or else in the address. */
 async function keepTour() {
+  const kept = tour.stops.length ? written({ prompts: [], stops: tour.fields }) : "";
+  const { done, told } = about.live ? await post("api/tour", { tour: kept, before: tour.before }) : { done: false };
+  if (done) about.tour = tour.before = kept;
+  else if (about.live) say(`The scene does not keep the tour: ${told}`);
+  tour.saved = done;
   keepAddress();
-  const answered = about.live && (await post("api/tour", { tour: written({ prompts: [], stops: tour.fields }) }));
-  if (answered && !answered.ok) say(`The scene does not keep the tour: ${await answered.text()}`);
+}
+
+/** Show the tour of an address. One without a tour shows the scene's own on a live page, whose file keeps it. */
+function showTour(stops) {
+  const own = readFields(about.tour).stops, saved = about.live && (!stops.length || String(stops) === String(own));
+  if (!saved || !tour.saved) Object.assign(tour, { fields: saved ? own : stops, before: saved ? about.tour : "" });
+  tour.saved = saved;
 }
 
 /** Teach a named word to the scene behind a live page, which answers it from then on; its card says what became of it. */
@@ -333,13 +352,13 @@ async function teachScene(prompt, before = prompt.text) {
   if (!prompt.named) return;
   const marks = asPython(prompt.examples, about.cameras), answered = about.live && marks.length ? await post("api/teach", { name: prompt.text, before, examples: marks }) : null;
   if (!about.live) prompt.told = "This browser keeps it. Save writes a file for lang3dxl words --load, which learns it from the photos.";
-  else if (answered && !answered.ok) prompt.told = `The scene did not learn it: ${await answered.text()}`;
+  else if (answered && !answered.done) prompt.told = `The scene did not learn it: ${answered.told}`;
   else if (answered) {
     taughtHere.add(prompt.text);
     await think("forget", { texts: [prompt.text, before] });
     prompt.inScene = true;
     await answer(prompt);
-    prompt.told = (await answered.json()).told;
+    prompt.told = JSON.parse(answered.told).told;
   }
   draw();
 }
@@ -352,9 +371,11 @@ function save(prompt) {
 async function forget(prompt) {
   kept.words = kept.words.filter(({ name }) => name !== prompt.text);
   remove(prompt);
-  if (!taughtHere.delete(prompt.text)) return;
-  await post("api/teach", { name: prompt.text, before: prompt.text, examples: [] });
+  taughtHere.delete(prompt.text);
+  if (!about.live) return;
+  const { done, told } = await post("api/teach", { name: prompt.text, before: prompt.text, examples: [] });
   await think("forget", { texts: [prompt.text] });
+  say(done ? JSON.parse(told).told : `The scene did not forget it: ${told}`);
 }
 
 /** Keep a named word in this browser; it replaces those with its present and former name. */
@@ -378,8 +399,8 @@ function asField(prompt) {
   return { kind: examples ? "like" : "ask", text: examples ? examplesAsText(prompt.text, examples) : asTyped(prompt), at: chosen, hue: about.colors.indexOf(color) };
 }
 
-/** What is shown, as an address. stops: of the tour. */
-const shownNow = (stops = tour.fields) =>
+/** What is shown, as an address. stops: of the tour, unless the scene's file keeps it. */
+const shownNow = (stops = tour.saved ? [] : tour.fields) =>
   written({
     stops,
     view: view.mover.address, shape: view.mover.aspect.toFixed(2), walk: view.mover.walking ? 1 : "", hide: $("hide").value === HALF ? "" : $("hide").value, look: chosenLook,
@@ -400,7 +421,7 @@ async function apply(hash, turn = drop(), isStop = false) {
   outlining?.abort();
   quiet();
   photos.hide();
-  if (!isStop) Object.assign(tour, { fields: wanted.stops }).stop();
+  if (!isStop) tour.stop(), showTour(wanted.stops);
   const there = view.mover.goTo(wanted.view, isStop, Number(wanted.shape) || 0), photo = photos.list.find((one) => one.photo && one.name === wanted.photo);
   view.mover.walk(wanted.walk === "1");
   if (!isStop) about.unit = Number(wanted.unit) > 0 && Number.isFinite(Number(wanted.unit)) ? Number(wanted.unit) : null;
@@ -542,7 +563,8 @@ function download(name, content) {
 
 async function copyLink() {
   keepAddress();
-  await navigator.clipboard.writeText(location.href);
+  if (!navigator.clipboard) return say("Copy the link from the browser's address bar: it opens what you see."); // without https
+  await navigator.clipboard.writeText(new URL(shownNow(tour.fields), location.href).href);
   say("The link is in the clipboard: it opens what you see.");
 }
 
@@ -582,14 +604,14 @@ async function open() {
   $("credit").textContent = [about.credit, about.license, about.made, ...about.left_out].filter(Boolean).join("\n");
   $("lighting").hidden = !Object.keys(about.looks).length;
   $("look").append(...Object.keys(about.looks).map((name) => element("option", { value: name }, name)));
-  for (const control of [...$("ask").elements, $("teach")]) control.disabled = !about.words;
+  for (const control of [...$("ask").elements, $("teach"), $("measuring")]) control.disabled = !about.words;
   const splats = await (await fetched("splats.bin", about)).arrayBuffer();
   await unpacked;
   view = new View(about, $("frame"));
   list = new List(about, think, view, prompts);
   photos = new Photos(about, view, (name) => attempt(() => light(name in about.looks ? name : chosenLook)));
   photos.changed = keepAddress;
-  tour = new Tour(() => shownNow([]), (hash) => attempt(() => apply(hash, drop(), true)), () => attempt(keepTour));
+  tour = new Tour(() => shownNow([]), (hash) => attempt(() => apply(hash, drop(), true)), () => (keeping = keeping.then(() => attempt(keepTour))));
   steps = new Steps((hash) => attempt(() => apply(hash)), () => {
     $("undo").disabled = !steps.past;
     $("redo").disabled = !steps.future;
@@ -624,7 +646,7 @@ async function begin() {
   const { stops, play } = readFields(location.hash);
   if (location.hash.length > 1) await apply(location.hash, turn);
   else for (const [text, ...negatives] of about.prompts) if (turn === cleared) await ask(asTyped({ text, negatives }), turn);
-  if (!stops.length) tour.fields = readFields(about.tour).stops;
+  if (!stops.length) showTour(readFields(about.tour).stops);
   if (location.hash.length <= 1 && turn === cleared) settle("");
   if (play) tour.play();
 }

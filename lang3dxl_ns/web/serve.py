@@ -11,6 +11,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from socketserver import TCPServer
 from urllib.parse import parse_qsl, urlsplit
 
+from lang3dxl_ns.common.checks import disk_trouble
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.web.access import Access
 from lang3dxl_ns.web.write_page import Page
@@ -19,6 +20,8 @@ FIRST_PORT, PORTS = 7007, 20
 """First port, and number of ports, that are tried if none is requested."""
 _PATIENCE = 30.0
 """Seconds that a connection may stay silent before it is closed."""
+_PART = 65536
+"""Bytes that are sent at a time."""
 _KINDS = {
     "html": "text/html; charset=utf-8",
     "css": "text/css; charset=utf-8",
@@ -63,7 +66,7 @@ class PageServer(ThreadingHTTPServer):
     def server_bind(self) -> None:
         """Bind without resolving this machine's name, which may take seconds."""
         TCPServer.server_bind(self)
-        self.server_name, self.server_port = self.access.host, self.server_address[1]
+        self.server_port = self.server_address[1]
 
     def answer(self, path: str) -> tuple[HTTPStatus, str, bytes]:
         """Return status, type and content for a path of the page or of its API."""
@@ -81,7 +84,10 @@ class PageServer(ThreadingHTTPServer):
         name = place.path.removeprefix("/") or "index.html"
         if name not in self.files:
             return HTTPStatus.NOT_FOUND, "text/plain", b"404\n"
-        return HTTPStatus.OK, _KINDS.get(name.rpartition(".")[2], _BYTES), self.files[name]
+        content = self.files[name]
+        if name == "scene.json":  # a new tab opens with the tour that was kept last
+            content = json.dumps(json.loads(content) | {"tour": self.page.provenance.tour}).encode()
+        return HTTPStatus.OK, _KINDS.get(name.rpartition(".")[2], _BYTES), content
 
 
 class Handler(BaseHTTPRequestHandler):
@@ -128,9 +134,12 @@ class Handler(BaseHTTPRequestHandler):
             return self._send(*refused)
         try:
             status, kind, content = answer()
-        except (UserError, ValueError) as error:  # an impossible address raises ValueError
+        except (ConnectionError, TimeoutError):  # of the browser
+            raise
+        except (UserError, ValueError, OSError) as error:  # an impossible address raises ValueError
             status, kind = HTTPStatus.BAD_REQUEST, _KINDS["txt"]
-            content = f"{error}".encode("utf-8", "replace")
+            trouble = disk_trouble(error) if isinstance(error, OSError) else None
+            content = (trouble or f"{error}").encode("utf-8", "replace")
         self._send(status, {"Content-Type": kind}, content)
 
     def _send(self, status: HTTPStatus, headers: Mapping[str, str], content: bytes) -> None:
@@ -138,7 +147,8 @@ class Handler(BaseHTTPRequestHandler):
         for name, value in {**_HEADERS, **headers, "Content-Length": str(len(content))}.items():
             self.send_header(name, value)
         self.end_headers()
-        self.wfile.write(content)
+        for start in range(0, len(content), _PART):  # each has the whole patience
+            self.wfile.write(content[start : start + _PART])
 
     def log_message(self, *_: object) -> None:
         """Log nothing, where the parent would log every request."""

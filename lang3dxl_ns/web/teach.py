@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from threading import Lock
@@ -37,44 +39,60 @@ class PageWords:
             examples = [Example.from_json(example) for example in content["examples"]]
         except DAMAGE as error:
             raise UserError(f"these are not marks of a word ({error}): load the page again") from error
-        with self._one:
-            if self.file is None:
-                return self._taught(scene, name, before, examples)
-            with locked(self.file.resolve().parent):  # another command that teaches comes first, or waits
-                known = {known_word(word.name): word for word in describe_scene_file(self.file)["taught"]}
-                scene, told = self._taught(scene.with_words(known.values()), name, before, examples)
-                new, keys = scene.words, {known_word(name), known_word(before)}
-                keep_words(self.file, {k: new.get(k) for k in keys if new.get(k) is not known.get(k)})
+        keys = {known_word(name), known_word(before)}
+        with self._one, nullcontext() if self.file is None else locked(self.file.resolve().parent):
+            if self.file is not None:  # another command that teaches comes first, or waits
+                scene = scene.with_words(describe_scene_file(self.file)["taught"])
+            known = scene.words
+            scene, told, marked = self._taught(scene, name, before, examples)
+            changed = {k: scene.words.get(k) for k in keys if scene.words.get(k) is not known.get(k)}
+            if self.file is not None and changed:
+                keep_words(self.file, changed)
+            self._marked |= {known_word(before): [], known_word(name): marked}
         return scene, told
 
-    def keep_tour(self, content: Mapping[str, Any]) -> str:
-        """Keep a page's tour in the scene file, if there is one, and return it. Raises UserError for other
-        content."""
-        if not isinstance(content, dict) or not isinstance(tour := content.get("tour"), str):
+    def keep_tour(self, content: Mapping[str, Any], known: str) -> tuple[str, bool]:
+        """Keep a page's tour, in the scene file if there is one, unless a tour is there (without a file: the
+        `known` one) that the page did not have `before`. Return the tour that is kept now, and whether it is
+        the page's. Raises UserError for other content."""
+        told = [content.get(name) for name in ("tour", "before")] if isinstance(content, dict) else []
+        if [*map(type, told)] != [str, str]:
             raise UserError("this is not a tour: load the page again")
-        if self.file is not None:
-            with self._one, locked(self.file.resolve().parent):
+        tour, before = map(str, told)
+        with self._one, nullcontext() if self.file is None else locked(self.file.resolve().parent):
+            kept = known if self.file is None else describe_scene_file(self.file)["provenance"].tour
+            if kept not in ("", before):
+                return kept, False
+            if self.file is not None:
                 keep_words(self.file, {}, tour)
-        return tour
+        return tour, True
 
-    def _taught(self, scene: Scene, name: str, before: str, examples: Sequence[Example]) -> tuple[Scene, str]:
+    def _taught(
+        self, scene: Scene, name: str, before: str, examples: Sequence[Example]
+    ) -> tuple[Scene, str, list[dict[str, Any]]]:
+        """Return the scene, the sentence for the page, and the examples of pages that the word has now."""
         for former in {known_word(before), known_word(name)}:
-            scene = self._without_marks(scene, former)
+            scene = self._without_marks(scene, former, examples)
         key = known_word(name)
         others = scene.words[key].examples if key in scene.words else ()
         if not examples:
-            return scene, f"The scene forgot {name!r}."
+            stay = f"Examples that were taught elsewhere stay ({len(others)}): lang3dxl words"
+            remedy = f"{shlex.quote(str(self.file or 'SCENE'))} --forget {shlex.quote(name)}"
+            return scene, f"{stay} {remedy}" if others else f"The scene forgot {name!r}.", []
         scene = scene.teach(name, [*others, *examples])
         word = scene.words[key]
-        self._marked[key] = [example.to_json() for example in word.examples[len(others) :]]
         place = "It lasts until the server ends." if self.file is None else f"{self.file.name} keeps it."
-        return scene, f"Taught by {len(word.examples)} photo{'s' * (len(word.examples) > 1)}. {place}"
+        told = f"Taught by {len(word.examples)} photo{'s' * (len(word.examples) > 1)}. {place}"
+        return scene, told, [example.to_json() for example in word.examples[len(others) :]]
 
-    def _without_marks(self, scene: Scene, name: str) -> Scene:
-        """Return the scene without what pages marked for a word. Other examples stay."""
-        word, ours = scene.words.get(name), self._marked.pop(name, [])
-        if word is None or not ours:
+    def _without_marks(self, scene: Scene, name: str, examples: Sequence[Example]) -> Scene:
+        """Return the scene without what pages marked for a word: in this server's time, or earlier and among
+        these examples. Others stay."""
+        word, ours = scene.words.get(name), self._marked.get(name, [])
+        if word is None:
             return scene
-        left = [example for example in word.examples if example.to_json() not in ours]
+        left = [e for e in word.examples if e.to_json() not in ours and not any(n.has(e) for n in examples)]
+        if len(left) == len(word.examples):
+            return scene
         scene = scene.with_words(other for other in scene.words.values() if other is not word)
         return scene.teach(word.name, left) if left else scene

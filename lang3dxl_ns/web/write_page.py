@@ -32,7 +32,13 @@ from lang3dxl_ns.query.text import Prompt, tidy, why_no_words
 from lang3dxl_ns.query.thresholds import EVEN, SHARE
 from lang3dxl_ns.query.trust import ALIKE, ANCHORS, CLEARLY, FAINT, FAR, STRICTER, STRICTEST
 from lang3dxl_ns.query.visibility import spread
-from lang3dxl_ns.query.vocabulary import closest_word, common_words, same_thing, shipped_vocabulary
+from lang3dxl_ns.query.vocabulary import (
+    closest_word,
+    common_words,
+    same_thing,
+    searched,
+    shipped_vocabulary,
+)
 from lang3dxl_ns.things import find, grammar, join, outlines, pieces, thing
 from lang3dxl_ns.web import pack
 from lang3dxl_ns.web.levels import MOST_ROWS, SMALL, Levels, levels_of
@@ -228,7 +234,9 @@ class Page:
             "foreign": scene.foreignness,
             "pixels": [pack.LEAST_PIXELS, pack.PIXEL_STEPS],
         }
-        seen, named = scene.visible, [*(word.name for word in scene.words.values()), *self.words, *self.more]
+        # Single words need no protection from being split, and CLIP's have "and" and "not" among them.
+        phrases = [word for word in (*self.words, *self.more) if " " in word]
+        seen, named = scene.visible, [*(word.name for word in scene.words.values()), *phrases]
         packed = {name: pack.view_bytes(view, len(scene.splats)) for name, view in seen.items()}
         views = self._within_limits("views", list(packed), list(map(len, packed.values())))
         about = {
@@ -278,12 +286,12 @@ class Page:
         count = len(negatives) + len(words)
         special, learned = {}, {}
         for i, word in enumerate(words):
-            known = taught.get(known_word(word))
-            if i < len(naming) or known is not None or self.scene.text.synonyms(word):
+            known, renamed = taught.get(known_word(word)), searched(word) != word  # haus: house
+            if i < len(naming) or known is not None or renamed or self.scene.text.synonyms(word):
                 near, against = self._meant(meaning, word)
             else:
                 near, against = numbers[0][:1], competitors(negatives, [word])
-            if len(near) > 1:
+            if len(near) > 1 or renamed:
                 special[i] = [list(range(count, count + len(near))), against]
                 numbers.append(near)
                 count += len(near)
@@ -340,8 +348,12 @@ class Page:
         return {"told": told}
 
     def keep_tour(self, content: Mapping[str, Any]) -> None:
-        """Keep a tour, which the page then opens with; see `PageWords.keep_tour`."""
-        self.provenance = replace(self.provenance, tour=self.own_words.keep_tour(content))
+        """Keep a tour, which the page then opens with; see `PageWords.keep_tour`. Raises UserError if another
+        tour than the page knows is kept by now."""
+        tour, ours = self.own_words.keep_tour(content, self.provenance.tour)
+        self.provenance = replace(self.provenance, tour=tour)
+        if not ours:
+            raise UserError("another tab kept another one: open the page again, without # and what follows")
 
     def photo(self, name: str) -> bytes:
         """Read a small copy of a photo. Raises UserError if there is none."""

@@ -87,6 +87,12 @@ class Example:
         """Whether everything in the photo that is the word lies inside the marks."""
         return self.mask is not None or self.box is not None
 
+    def has(self, other: Example) -> bool:
+        """Return whether all marks of another example are marked here too, in the same photo."""
+        alike = self.photo == other.photo and self.box == other.box
+        points = {*other.points} <= {*self.points} and {*other.not_points} <= {*self.not_points}
+        return alike and points and np.array_equal(self.mask, other.mask)  # type: ignore[arg-type]
+
     def to_json(self) -> dict[str, Any]:
         """Convert the example to JSON, with masks as run lengths."""
         described: dict[str, Any] = {"photo": self.photo}

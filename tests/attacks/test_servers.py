@@ -7,6 +7,8 @@ import struct
 import threading
 import time
 import urllib.parse
+from http import HTTPStatus
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -42,6 +44,15 @@ def wide():
     with page_server() as server:
         server.access.host = "0.0.0.0"
         yield server
+
+
+def test_each_part_of_a_file_is_sent_with_a_patience_of_its_own():
+    content, parts, handler = bytes(range(256)) * 2000, [], serve.Handler.__new__(serve.Handler)
+    handler.wfile = SimpleNamespace(write=parts.append)
+    handler.request_version, handler.requestline = "HTTP/1.1", "GET /views.bin HTTP/1.1"
+    handler._send(HTTPStatus.OK, {}, content)
+    assert b"".join(parts).endswith(b"\r\n\r\n" + content)
+    assert max(map(len, parts)) <= 1 << 16
 
 
 # ── what it refuses ────────────────────────────────────────────────────────────────────────────

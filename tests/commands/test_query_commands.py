@@ -12,6 +12,7 @@ from lang3dxl_ns import cli
 from lang3dxl_ns.commands import export, query
 from lang3dxl_ns.commands.query import file_names
 from lang3dxl_ns.common.files import slugs
+from lang3dxl_ns.files.scene_file import Provenance
 
 
 @pytest.fixture
@@ -145,8 +146,32 @@ def test_export_refuses_what_its_file_cant_hold(run, tmp_path, option, name, mes
 @pytest.mark.parametrize("option", [("--threshold", 0.9), ("--size", 300), ("--synonyms", "off")])
 def test_export_refuses_settings_of_queries_without_a_text(run, tmp_path, target, option):
     name = {"--out": "a.ply", "--scene-file": "a.scene"}[target]
-    with pytest.raises(SystemExit, match="settings of queries have no effect without --text"):
+    give = ", or give one$" if target == "--out" else "$"  # which a scene file refuses
+    with pytest.raises(
+        SystemExit, match=f"settings of queries have no effect without --text: leave them off{give}"
+    ):
         run("export", "c", target, tmp_path / name, *option)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("view", "c", "--photos", "nowhere"), "nowhere is not a folder"),
+        (("export", "c", "--web", "page", "--photos", "nowhere"), "nowhere is not a folder"),
+        (("view", "c", "--tour", "--text", "windows"), "in place of --text: leave one off"),
+    ],
+)
+def test_mistakes_are_told_before_the_scene_loads(run, monkeypatch, words, message):
+    monkeypatch.setattr("lang3dxl_ns.open_scene.load_scene", None)
+    monkeypatch.setattr("lang3dxl_ns.commands.export.load_scene", None)
+    with pytest.raises(SystemExit, match=message):
+        run(*words)
+
+
+def test_a_film_has_a_use_for_settings_of_queries(run, monkeypatch, tmp_path):
+    monkeypatch.setattr(export, "provenance_of", lambda _: Provenance())
+    with pytest.raises(SystemExit, match="there is no tour"):  # after all options are accepted
+        run("export", "c", "--video", tmp_path / "a.mp4", "--foreground", "wall")
 
 
 def test_export_writes_the_matching_gaussians_or_all_with_scores(run, tmp_path):

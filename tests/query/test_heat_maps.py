@@ -1,9 +1,10 @@
 """Heat maps of relevancy."""
 
+import numpy as np
 import pytest
 import torch
 
-from lang3dxl_ns.query.heat_maps import color, heat, overlay, strongest, tinted
+from lang3dxl_ns.query.heat_maps import color, heat, overlay, strongest, tinted, with_legend
 
 RELEVANCY = torch.tensor([[0.0, 0.4, 0.5], [0.55, 0.6, 0.7]])
 IMAGE = torch.rand(2, 3, 3, generator=torch.Generator().manual_seed(0))
@@ -46,3 +47,12 @@ def test_colors_are_matplotlibs():
     colormaps = pytest.importorskip("matplotlib").colormaps
     expected = torch.from_numpy(colormaps["turbo"](values.clamp(0, 1).numpy())[:, :3]).float()
     torch.testing.assert_close(color(values), expected, atol=0.6 / 255, rtol=0)  # stored in bytes
+
+
+@pytest.mark.parametrize("label", ["wall", "red windows of the left tower " * 5, "w" * 200])
+def test_a_legend_holds_labels_of_any_length(label):
+    picture = np.zeros((20, 200, 3), np.uint8)
+    drawn = with_legend(picture, [label, "wall"])
+    assert np.array_equal(drawn[:20], picture) and (drawn[20:, -1] == 255).all()  # not cut
+    last = with_legend(picture, ["dome", "wall"])[-16:, 16:]
+    np.testing.assert_array_equal(drawn[-16:, 16:], last)  # below, whatever comes first

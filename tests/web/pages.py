@@ -21,7 +21,7 @@ from PIL import Image
 
 from lang3dxl_ns.components.compression import CompressedField
 from lang3dxl_ns.components.field_settings import SemanticFieldConfig
-from lang3dxl_ns.files.scene_file import read_scene
+from lang3dxl_ns.files.scene_file import describe_scene_file, read_scene
 from lang3dxl_ns.web.serve import PageServer
 from lang3dxl_ns.web.teach import PageWords
 from lang3dxl_ns.web.write_page import Page
@@ -120,7 +120,8 @@ def served(folder):
 @contextmanager
 def live(file, photos=None):
     scene = read_scene(file, "cpu")
-    page = Page(scene, photos=photos, live=True, own_words=PageWords(file))
+    told = describe_scene_file(file)["provenance"]
+    page = Page(scene, provenance=told, photos=photos, live=True, own_words=PageWords(file))
     server = PageServer(page, port=0)
     threading.Thread(target=server.serve_forever, daemon=True).start()
     yield server

@@ -123,6 +123,8 @@ def test_ask_answers_and_hostile_texts_stay_texts(page):
     assert answer["known"] and answer["matching"] > 50 and 0 < answer["threshold"] < answer["peak"] <= 1
     for text in (HOSTILE, "", ";;;", "x" * 5000, "__proto__", "constructor"):
         assert page.evaluate("(text) => lang3dxl.ask(text)", text)["known"] is False
+        told = page.locator("#status").inner_text()
+        assert ("Put what to find first" in told) == (text == ";;;"), text
     assert page.locator("h1").inner_text() == HOSTILE and page.title() == HOSTILE
     assert page.locator("img:not(#photo)").count() == 0
     page.evaluate("location.hash = 'view=nan,1,2&ask=%22%3Cimg%20src=x%3E&like=~x~-1.9e9~'")
@@ -279,6 +281,7 @@ def test_a_scene_without_words_cant_be_typed_to(browser, tmp_path):
         page = opened(browser, address + "#ask=dome&like=it~1", DESK)
         assert page.get_by_role("combobox", name="Look for").is_disabled()
         assert page.get_by_role("button", name="Ask").is_disabled() and prompts_of(page) == []
+        assert page.get_by_role("checkbox", name="Measure", include_hidden=True).is_disabled()
         until_told(page, "#status", "no words yet")
         page.get_by_role("button", name="Walk").click()
         page.get_by_role("button", name="Overview").click()

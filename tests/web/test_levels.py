@@ -4,6 +4,7 @@ import json
 from dataclasses import replace
 
 import numpy as np
+import pytest
 import torch
 import torch.nn.functional as F
 from pages import DESK, STAND, opened, picture, served
@@ -114,6 +115,19 @@ def test_copies_at_one_place_merge_to_themselves_and_the_invisible_weighs_nothin
     torch.testing.assert_close(whole.scales.sort(1).values, one.scales.sort(1).values)
     torch.testing.assert_close(whole.opacities, one.opacities)
     assert code.tolist() == [[codes[0, 0].item()]]
+
+
+@pytest.mark.parametrize(("part", "value"), [("means", -1e30), ("means", 1e20), ("scales", 1e26)])
+def test_one_gaussian_far_out_or_huge_leaves_the_others_as_they_are(part, value):
+    splats = painted_splats()
+    getattr(splats, part)[5] = value
+    opacities = splats.opacities.clone()
+    opacities[5] = 0
+    scenes = [painted_scene(splats=one) for one in (splats, replace(painted_splats(), opacities=opacities))]
+    coarse, expected = (levels_of(scene, MOST).scenes[0].splats for scene in scenes)
+    assert coarse.sound().all()
+    assert float(coarse.means.abs().max()) <= float(painted_splats().means.abs().max())
+    assert float(coarse.opacities.sum()) == pytest.approx(float(expected.opacities.sum()), rel=0.02)
 
 
 def test_the_finest_level_is_the_scene_and_coarser_ones_answer():

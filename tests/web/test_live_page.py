@@ -1,5 +1,6 @@
 """The page of `lang3dxl view` in Chromium: photos over the rendering, and words that its scene is taught."""
 
+import errno
 import http.client
 import json
 from dataclasses import replace
@@ -33,12 +34,12 @@ def photos(tmp_path_factory):
     return folder
 
 
-def posted(server, content, **headers):
+def posted(server, content, path="/api/teach", **headers):
     connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=60)
     origin = f"http://127.0.0.1:{server.server_port}"
     told = {"Content-Type": "application/json", "Origin": origin} | headers
     told = {name: value for name, value in told.items() if value is not None}
-    connection.request("POST", "/api/teach", content, told)
+    connection.request("POST", path, content, told)
     answer = connection.getresponse()
     return answer.status, answer.read().decode()
 
@@ -76,9 +77,56 @@ def test_a_page_replaces_its_own_marks_and_keeps_those_of_others(file):
             assert posted(server, json.dumps(content))[0] == 200
             assert len(in_file(file)[name]["examples"]) == expected
         assert in_file(file)["cupola"]["examples"] == before["cupola"].to_json()["examples"]
-        forgotten = {"name": "dome of mine", "before": "dome of mine", "examples": []}
-        assert posted(server, json.dumps(forgotten))[0] == 200
+        assert posted(server, marks_of("dome of mine")) == (
+            200,
+            '{"told": "The scene forgot \'dome of mine\'."}',
+        )
+        status, told = posted(server, marks_of("cupola"))
+        assert status == 200 and "stay (1): lang3dxl words" in told and "--forget cupola" in told
     assert list(in_file(file)) == ["cupola"]
+
+
+def marks_of(name, *examples):
+    return json.dumps({"name": name, "before": name, "examples": examples})
+
+
+def test_marks_are_kept_once_and_forgotten_after_a_refusal_and_another_server(file):
+    other, more = (CLICK | {"points": points} for points in ([[70, 70]], [[70, 70], [71, 71]]))
+    with live(file) as server:
+        for marks, status in ((CLICK, 200), (CLICK | {"points": [[690, 69]]}, 400), (other, 200)):
+            assert posted(server, marks_of("cupola", marks))[0] == status
+            assert len(in_file(file)["cupola"]["examples"]) == 1
+    with live(file) as server:
+        assert posted(server, marks_of("cupola", more))[0] == 200
+        (example,) = in_file(file)["cupola"]["examples"]
+        assert len(example["points"]) == 2
+        assert posted(server, marks_of("cupola"))[0] == 200
+    assert in_file(file) == {}
+
+
+def test_a_full_disk_is_told_and_changes_nothing(file, monkeypatch):
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left on device", "wall.scene")
+
+    with live(file) as server:
+        for room, name in (("teach", "keep_words"), ("write_page", "small_photo")):
+            monkeypatch.setattr(f"lang3dxl_ns.web.{room}.{name}", full)
+        server.page.photos = file.parent
+        for answer in (
+            posted(server, marks_of("cupola", CLICK)),
+            posted(server, json.dumps({"tour": "#stop=", "before": ""}), "/api/tour"),
+            got(server, f"/api/photo?name={ALL}"),
+        ):
+            assert answer[0] == 400 and "wall.scene: No space left on device; " in answer[1]
+        assert "cupola" not in server.page.scene.words and server.page.provenance.tour == ""
+        monkeypatch.undo()
+
+
+def got(server, path):
+    connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=60)
+    connection.request("GET", path)
+    answer = connection.getresponse()
+    return answer.status, answer.read().decode()
 
 
 REFUSED = [
@@ -180,9 +228,12 @@ def test_a_word_taught_in_the_page_is_in_the_scenes_file_and_in_the_page(browser
         until(page, lambda: in_file(file)["cupola of mine"]["examples"] != word["examples"])
         page.get_by_role("button", name="Undo").click()
         until(page, lambda: in_file(file)["cupola of mine"], word)
+        page.reload()
+        page.evaluate("lang3dxl.ready.then(() => true)")
+        page.get_by_role("button", name="Add", exact=True).click()
         page.get_by_role("button", name="Forget").click()
-        until(page, lambda: in_file(file), {})
-        assert page.complaints == []
+        until_told(page, "#status", "The scene forgot")
+        assert in_file(file) == {} and page.complaints == []
         page.close()
 
 

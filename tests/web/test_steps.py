@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from pages import DESK, SIDE, opened, picture, prompts_of, until, until_linked
+from pages import DESK, SIDE, opened, picture, prompts_of, until, until_linked, until_told
 
 
 @pytest.mark.slow
@@ -78,6 +78,19 @@ def test_a_link_carries_thresholds_colors_and_moving(page, browser, address):
     assert shown[0][0][1] == 0.77
     other.close()
     page.get_by_role("button", name="Walk").click()
+
+
+def test_a_link_is_copied_or_its_place_is_told(page):
+    for clipboard, told in (
+        ("{ writeText: (link) => (window.copied = link) }", "in the clipboard"),
+        ("undefined", "address bar"),
+    ):
+        page.evaluate(
+            f"Object.defineProperty(navigator, 'clipboard', {{ value: {clipboard}, configurable: true }})"
+        )
+        page.get_by_role("button", name="Copy link").click()
+        until_told(page, "#status", told)
+    assert page.evaluate("window.copied === location.href")
 
 
 @pytest.mark.slow

@@ -14,7 +14,7 @@ from painted_scene import painted_file, painted_looks, painted_scene, painted_sp
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import read_names
 from lang3dxl_ns.query.text import NO_SEMANTICS, NOT_FINISHED
-from lang3dxl_ns.query.vocabulary import common_words, shipped_vocabulary, whole_words
+from lang3dxl_ns.query.vocabulary import common_words, searched, shipped_vocabulary, whole_words
 from lang3dxl_ns.web.photos import extent
 from lang3dxl_ns.web.write_page import _DATA, Page, write_page
 
@@ -160,6 +160,21 @@ def test_a_vocabulary_of_ones_own_is_offered_and_named(tmp_path):
         Page(painted_scene(), words=["lych gate"], more=["porch", "zoo"]).files()["vocabulary.json"]
     )
     assert described["words"][: described["naming"]] == [*shipped_vocabulary(), "lych gate"]
+
+
+def test_words_of_a_tokenizer_are_searched_for_as_in_python_and_split_as_in_python():
+    page = Page(painted_scene(), more=["haus", "and", "not", "rose garden"])
+    files = page.files()
+    described, about = (json.loads(files[name]) for name in ("vocabulary.json", "scene.json"))
+    assert about["names"] == ["rose garden"]  # "windows and doors" are two
+    renamed = {i: word for i, word in enumerate(described["words"]) if searched(word) != word}
+    assert {"haus", "upper windows"} <= {*renamed.values()}
+    numbers = np.frombuffer(files["vocabulary.bin"], "<f2").reshape(-1, about["words"]["width"])
+    for i, word in renamed.items():
+        rows, against = described["special"][str(i)]
+        near, rivals = page._meant(page._meaning, word)
+        assert against == rivals and len(rows) == len(near)
+        np.testing.assert_allclose(numbers[rows], near.numpy(), atol=2e-3)
 
 
 def test_a_scene_that_is_wider_than_half_precision_is_refused_and_a_stray_gaussian_is_not():
