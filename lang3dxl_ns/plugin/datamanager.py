@@ -35,6 +35,7 @@ from lang3dxl_ns.preparation.settings import PreparationConfig
 from lang3dxl_ns.preparation.targets import FACTS, Batch, SceneFacts
 from lang3dxl_ns.scene.camera import LONGEST_SIDE
 from lang3dxl_ns.scene.capture import recorded_capture
+from lang3dxl_ns.scene.capture_settings import CAPTURE_BOUNDS
 from lang3dxl_ns.scene.companions import cache_folder
 from lang3dxl_ns.scene.record import SCENE_FILE, SceneRecord
 from lang3dxl_ns.training.batches import TrainingData
@@ -72,7 +73,7 @@ class Lang3DXLDataManagerConfig(PreparationConfig, FullImageDatamanagerConfig):
 
 
 _BOUNDS = {"camera_res_scale_factor": (0.001, 8), "cache_gb": (0, 1e6), "read_ahead": (0, 1000)}
-_OF_PARSER = {"scale_factor": (1e-9, 1e9), "scene_scale": (1e-9, 1e9)}
+_OF_PARSER = {**CAPTURE_BOUNDS, "scene_scale": (1e-9, 1e9)}
 
 
 class Lang3DXLDataManager(FullImageDatamanager):
@@ -128,11 +129,11 @@ class Lang3DXLDataManager(FullImageDatamanager):
     def setup_train(self) -> None:
         """Prepare missing targets before training; give the model their statistics and the scene's needs."""
         if self.test_mode == "val":
-            photos, trained = len(self.data.capture.photos), len(self.data.capture.split.train)
-            if trained < photos:
+            capture = self.data.capture
+            if held_out := set(capture.split.held_out).difference(capture.split.train):
                 say(
-                    f"{photos - trained} of {photos} photos are held out of training, for evaluation "
-                    "(`lang3dxl-colmap --eval-mode all` after all other options trains on all)"
+                    f"{len(held_out)} of {len(capture.photos)} photos are held out of training, for "
+                    "evaluation (`lang3dxl-colmap --eval-mode all` after all other options trains on all)"
                 )
             say(needs_table(self.data.needs))
             self.train_dataset.metadata[FACTS] = self.data.facts()

@@ -27,7 +27,7 @@ from scipy.spatial import KDTree
 
 from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import DAMAGE, UserError
-from lang3dxl_ns.common.files import expanded, locked, make_folder, read_json, replace_file
+from lang3dxl_ns.common.files import absolute, locked, make_folder, read_json, replace_file
 from lang3dxl_ns.scene.colmap import load_pycolmap, read_reconstruction
 from lang3dxl_ns.scene.companions import cache_folder, inside
 from lang3dxl_ns.scene.layout import find_model, has_model, images_folder
@@ -90,7 +90,7 @@ def add_photos(
         settings = replace(settings, features="sift")
     if settings.mapper != "incremental":
         raise UserError("--add places photos without a mapper: leave out --mapper")
-    data, folder = expanded(data).absolute(), expanded(folder).absolute()
+    data, folder = absolute(data), absolute(folder)
     if is_video(folder):
         folder = extract_frames(folder)
     cache = cache_folder(data, cache_dir).absolute()
