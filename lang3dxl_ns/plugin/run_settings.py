@@ -10,6 +10,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import MISSING, fields, is_dataclass
 from enum import Enum, EnumMeta
 from functools import cache
+from math import isnan
 from pathlib import Path, PurePath, PurePosixPath, PureWindowsPath
 from typing import Any, get_type_hints
 
@@ -102,13 +103,17 @@ def _differences(settings: Any, complete: bool, place: str = "") -> Iterator[str
             vars(settings)[name] = default  # settings may be frozen
         value = getattr(settings, name)
         if name == "_target" and value is not default:
-            yield f"would start {place}{name} {reprlib.repr(value)}"
+            yield f"would start {place}{name} {_begin(value)}"
         fits = name not in hints or _fits(value, hints[name]) or not _fits(default, hints[name])
         if not fits and name != _UNREAD:
-            # A few aliases in a file may stand for a list of any length.
-            yield f"sets {place}{name} to {reprlib.repr(value)}, of another kind than this setting"
+            yield f"sets {place}{name} to {_begin(value)}, of another kind than this setting"
         elif is_dataclass(value) and not isinstance(value, type):
             yield from _differences(value, complete, f"{place}{name}.")
+
+
+def _begin(value: Any) -> str:
+    """Describe a value in a few letters: a file's aliases may stand for a list of any length."""
+    return reprlib.repr(value)[:40]
 
 
 @cache
@@ -125,7 +130,7 @@ def _fits(value: Any, hint: Any) -> bool:
         check_type(value, hint)
     except TypeCheckError:
         return False
-    return bool(value == value)
+    return not (isinstance(value, float) and isnan(value))
 
 
 def check_command_line(arguments: Sequence[str]) -> None:
