@@ -57,7 +57,7 @@ class EvaluateMaps(_Scored):
         if not self.temperature > 0:
             raise UserError(f"--temperature is {self.temperature}: give a number above 0")
         truth = GroundTruth(self.ground_truth, self.layout)
-        names = None if self.photos is None else read_names(self.photos)
+        names = None if self.photos is None else read_names(self.photos, known=truth.labeled)
         photos, protocol = score_predictions(truth, self.maps, names, self.masks, self.temperature)
         results = average(list(photos.values()), with_deviation=True)
         results |= {"protocol": protocol, "photos": photos}

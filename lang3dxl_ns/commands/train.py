@@ -73,9 +73,9 @@ class Train(RunSettings, SceneSettings, PreparationConfig, CaptureSettings):
             changes: settings that the caller has other usual values for.
         """
         parser = ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
-        parser.add_argument("--method")
+        parser.add_argument("--method", nargs="?")
         usual = cls(data=tyro.MISSING)
-        given, _ = parser.parse_known_args([*words, ""])  # with a value for a last word --method, too
+        given, _ = parser.parse_known_args(words)
         if given.method == "lang3dxl-paper":
             plain_as_printed(usual, usual)
             usual.looks, usual.photo_scale = PRINTED_LOOKS, PRINTED_PHOTO_SCALE

@@ -11,7 +11,7 @@ import re
 import secrets
 import shutil
 import stat
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -86,7 +86,7 @@ def write_atomically(path: Path, content: str | bytes) -> None:
     if path.exists() and not path.is_file():
         path.write_bytes(content.encode() if isinstance(content, str) else content)
         return
-    replace_file(path.resolve(), content)
+    replace_file(followed(path), content)
 
 
 def replace_file(path: Path, content: str | bytes) -> None:
@@ -134,7 +134,7 @@ def own_folder(folder: Path, skipped: str = "") -> Path:
 
 def set_aside(path: Path) -> Path:
     """Rename a file that is not ours to overwrite to NAME.old, or NAME.old2 …, and return the new name."""
-    path = path.resolve()
+    path = followed(path)
     forms = (path.with_name(f"{path.name}.old{number or ''}") for number in (0, *range(2, 10_000)))
     kept = next(form for form in forms if not os.path.lexists(form))
     path.rename(kept)
@@ -166,7 +166,7 @@ def locked(folder: Path, busy: str | None = None) -> Iterator[None]:
 def file_locked(path: Path) -> Iterator[None]:
     """Hold the lock under which a file is changed: that of the folder that the file itself is in, whichever
     link names it. Wait for it like `locked`."""
-    with locked(path.resolve().parent):
+    with locked(followed(path).parent):
         yield
 
 
@@ -180,6 +180,14 @@ def replace_durably(partial: Path, path: Path) -> None:
         os.fsync(folder)
     finally:
         os.close(folder)
+
+
+def followed(path: Path) -> Path:
+    """Return the place that a path leads to through links; nothing may be there yet. Raises OSError for links
+    in a circle."""
+    with contextlib.suppress(FileNotFoundError):
+        return Path(os.path.realpath(path, strict=True))
+    return Path(os.path.realpath(path))
 
 
 def make_folder(folder: Path) -> None:
@@ -212,6 +220,13 @@ def expanded(path: str | Path) -> Path:
         raise UserError(f"{path}: there is no such user; write the folder's whole name") from error
 
 
+def absolute(path: str | Path) -> Path:
+    """Expand a path, and complete it from the root on. Its last part is a name and not `..`, so that results
+    can be named after it. Raises UserError as `expanded`."""
+    path = expanded(path)
+    return Path(os.path.realpath(path)) if ".." in path.parts else path.absolute()
+
+
 def slugs(texts: Sequence[str]) -> list[str]:
     """Choose a unique folder name for each text, valid whatever the text contains."""
     found: list[str] = []
@@ -222,12 +237,14 @@ def slugs(texts: Sequence[str]) -> list[str]:
     return found
 
 
-def read_names(path: Path, what: str = "photos") -> tuple[str, ...]:
+def read_names(path: Path, what: str = "photos", known: Collection[str] = ()) -> tuple[str, ...]:
     """Read names of photos, or other texts (`what` in messages), one per line of a file, each once. Blank
-    lines and comments (#) are skipped. Raises UserError for a file that cannot be read or is empty."""
+    lines and comments (#) are skipped; a # in a `known` name begins none. Raises UserError for a file that
+    cannot be read or is empty."""
     with readable(f"the list of {what} {path} can't be read", "correct or replace it"):
-        lines = read_text(expanded(path)).splitlines()
-    names = tuple(dict.fromkeys(name for line in lines if (name := re.sub(r"(^|\s)#.*", "", line).strip())))
+        lines = [line.strip() for line in read_text(expanded(path)).splitlines()]
+    found = (line if line in known else re.sub(r"(^|\s)#.*", "", line).strip() for line in lines)
+    names = tuple(filter(None, dict.fromkeys(found)))
     if not names:
         raise UserError(f"the list of {what} {path} is empty: write one per line")
     return names

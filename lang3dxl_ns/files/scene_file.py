@@ -212,8 +212,9 @@ def replace_scene(path: Path, scene: Scene, told: Provenance, *earlier: Path) ->
 
 def _with_words_of(scene: Scene, earlier: Path, replaced: Path) -> Scene:
     """Return the scene with a file's taught words, where it doesn't know them. Log which are kept and how,
-    and which are lost. A missing file has no words. Words of the `replaced` file that the scene knows from
-    other examples are saved beside it."""
+    and which are lost. A missing file has no words. Words of the `replaced` file that are lost, or that the
+    scene knows from other examples, are saved beside it. In a scene that has a CLIP but no words yet, since
+    its training goes on, they wait as they are."""
     if not earlier.is_file():
         return scene
     try:
@@ -225,22 +226,31 @@ def _with_words_of(scene: Scene, earlier: Path, replaced: Path) -> Scene:
         name, new = known_word(word.name), scene.words.get(known_word(word.name))
         if new is not None:
             if earlier == replaced and new.lacks_examples_of(word):
-                backup = earlier.with_name(f"{earlier.stem}.{slugs([name])[0]}.json")
-                if backup.exists():
-                    set_aside(backup)
-                save_words(backup, [word])
-                say(f"The taught word {word.name!r} is replaced; with its examples it is kept in {backup}")
+                say(f"The taught word {word.name!r} is replaced; {_kept_beside(earlier, word)}")
+            continue
+        if scene.decoder is None and scene.file.clip is not None:
+            scene = scene.with_words([*scene.words.values(), word])
             continue
         try:
             scene = scene.carrying(word)
         except UserError as error:
-            say(f"The taught word {word.name!r} is lost: {error}")
+            kept = f"; {_kept_beside(earlier, word)}" if earlier == replaced else ""
+            say(f"The taught word {word.name!r} is lost: {error}{kept}")
             continue
         count, all_ = len(scene.words[name].examples), len(word.examples)
         how = f"learned anew from its examples ({count})" if count else "as it was: check it in a few photos"
         how += f"; the photos of {all_ - count} others are not those of before" if 0 < count < all_ else ""
         say(f"The taught word {word.name!r} is kept, {how}")
     return scene
+
+
+def _kept_beside(scene: Path, word: TaughtWord) -> str:
+    """Save a word with its examples beside its scene's file, and say where."""
+    backup = scene.with_name(f"{scene.stem}.{slugs([known_word(word.name)])[0]}.json")
+    if backup.exists():
+        set_aside(backup)
+    save_words(backup, [word])
+    return f"with its examples it is kept in {backup}"
 
 
 def _stored_state(name: str, module: torch.nn.Module) -> dict[str, Shaped[Array, "..."]]:

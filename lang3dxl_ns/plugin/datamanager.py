@@ -35,6 +35,7 @@ from lang3dxl_ns.preparation.settings import PreparationConfig
 from lang3dxl_ns.preparation.targets import FACTS, Batch, SceneFacts
 from lang3dxl_ns.scene.camera import LONGEST_SIDE
 from lang3dxl_ns.scene.capture import recorded_capture, say_held_out
+from lang3dxl_ns.scene.capture_settings import CAPTURE_BOUNDS
 from lang3dxl_ns.scene.companions import cache_folder
 from lang3dxl_ns.scene.record import SCENE_FILE, SceneRecord
 from lang3dxl_ns.training.batches import TrainingData
@@ -72,7 +73,7 @@ class Lang3DXLDataManagerConfig(PreparationConfig, FullImageDatamanagerConfig):
 
 
 _BOUNDS = {"camera_res_scale_factor": (0.001, 8), "cache_gb": (0, 1e6), "read_ahead": (0, 1000)}
-_OF_PARSER = {"scale_factor": (1e-9, 1e9), "scene_scale": (1e-9, 1e9)}
+_OF_PARSER = {**CAPTURE_BOUNDS, "scene_scale": (1e-9, 1e9)}
 
 
 class Lang3DXLDataManager(FullImageDatamanager):

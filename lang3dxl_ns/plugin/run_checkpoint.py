@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import zipfile
 from pathlib import Path
 from typing import Any
 
-from lang3dxl_ns.common.errors import DAMAGE, UserError, readable
-from lang3dxl_ns.common.files import check_regular
-from lang3dxl_ns.training.checkpoint import NOT_A_CHECKPOINT, load_checked
+from lang3dxl_ns.common.errors import UserError, readable
+from lang3dxl_ns.training.checkpoint import NOT_A_CHECKPOINT, check_whole, load_checked
 
 
 def latest_checkpoint(folder: Path) -> tuple[Path, dict[str, Any]]:
@@ -37,15 +35,9 @@ def check_checkpoint(place: Path) -> None:
     checkpoints = sorted(place.glob("step-*.ckpt")) if place.is_dir() else [place]
     if not checkpoints or not checkpoints[-1].exists():
         return
-    try:
-        check_regular(checkpoints[-1])
-        with zipfile.ZipFile(checkpoints[-1]) as archive:
-            packed = any(part.compress_type != zipfile.ZIP_STORED for part in archive.infolist())
-            damaged = "packed, as torch writes none" if packed else archive.testzip()
-    except DAMAGE:
-        damaged = "the whole file"
-    if damaged is not None:
-        raise UserError(
-            f"the checkpoint {checkpoints[-1]} is damaged ({damaged}), perhaps by an incomplete copy: copy "
-            "it again, move it away to resume from an earlier one, or train anew (prepared targets are kept)"
-        )
+    remedy = (
+        "perhaps by an incomplete copy: copy it again, move it away to resume from an earlier one, or train "
+        "anew (prepared targets are kept)"
+    )
+    with readable(f"the checkpoint {checkpoints[-1]} is damaged", remedy):
+        check_whole(checkpoints[-1])

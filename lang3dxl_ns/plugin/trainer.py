@@ -39,7 +39,7 @@ from lang3dxl_ns.plugin.run_checkpoint import check_checkpoint, read_checkpoint
 from lang3dxl_ns.preparation.needs import NEEDS_FILE, write_needs
 from lang3dxl_ns.preparation.store import PhotosGoneError
 from lang3dxl_ns.scene.record import SCENE_FILE, SceneRecord
-from lang3dxl_ns.training.checkpoint import NOT_A_CHECKPOINT, check_same_photos, save_checkpoint
+from lang3dxl_ns.training.checkpoint import NOT_A_CHECKPOINT, alone_in, check_same_photos, save_checkpoint
 from lang3dxl_ns.training.estimate import estimate
 from lang3dxl_ns.training.learn_codes import forget_words
 from lang3dxl_ns.training.learning_rates import add_rows_to_state
@@ -188,9 +188,13 @@ class Lang3DXLTrainer(Trainer):
         check_checkpoint(path)
         state = read_checkpoint(path)
         if (before := path.parent.with_name(SCENE_FILE)).is_file():
-            corrected = any(name.endswith("pose_adjustment") for name in state["pipeline"])
-            data = self.pipeline.datamanager.data
-            check_same_photos(path, SceneRecord.read(before), data.record(), corrected)
+            record, data = SceneRecord.read(before), self.pipeline.datamanager.data
+            if not record.has_frame(data.capture.recorded_frame):
+                raise UserError(
+                    f"{path} belongs to other photos or another reconstruction of them: train anew"
+                )
+            splits = {photo.name: photo.split for photo in record.photos}
+            check_same_photos(path, splits, data.splits, state["pipeline"])
         remedy = "give --load-dir a run's folder nerfstudio_models, or --load-checkpoint one of its files"
         with readable(f"{path} is not a checkpoint of lang3dxl", remedy, NOT_A_CHECKPOINT):
             self._start_step = state["step"] + 1
@@ -272,7 +276,7 @@ class Lang3DXLTrainer(Trainer):
             self._announce_time()
             writer.GLOBAL_BUFFER.setdefault("step", self.step)  # the end reads it, also without any step
             self.stages.begin("train")
-            with stoppable(self._stop), _disk_kept_out_of_training():
+            with alone_in(self.base_dir), stoppable(self._stop), _disk_kept_out_of_training():
                 super().train()
         except PhotosGoneError as error:
             raise UserError(f"{error}. {self._stop_early()}") from error

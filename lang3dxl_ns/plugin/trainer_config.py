@@ -14,7 +14,7 @@ from lang3dxl_ns.common.checks import check_numbers
 from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.device import best_device, warn_of_unused_gpu
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.common.files import expanded
+from lang3dxl_ns.common.files import absolute, expanded
 from lang3dxl_ns.common.settings_help import showing
 from lang3dxl_ns.files.runs import find_config
 from lang3dxl_ns.plugin.dataparser import PhotoCollectionDataParserConfig
@@ -143,13 +143,13 @@ class Lang3DXLTrainerConfig(RunConfig):
             choice = getattr(datamanager, name)
             if choice not in (BUILTIN, "none", "auto") and expanded(choice).is_dir():
                 setattr(datamanager, name, str(_absolute(Path(choice))))
-        datamanager.dataparser.data = expanded(datamanager.dataparser.data).absolute()
+        datamanager.dataparser.data = absolute(datamanager.dataparser.data)
         datamanager.data = _absolute(datamanager.data or self.data)
         self.data, datamanager.cache_dir = datamanager.data, _absolute(datamanager.cache_dir)
         self.pipeline.ground_truth = _absolute(self.pipeline.ground_truth)
         if isinstance(datamanager.dataparser, PhotoCollectionDataParserConfig):
             datamanager.dataparser.held_out = _absolute(datamanager.dataparser.held_out)
-        self.output_dir = expanded(self.output_dir).absolute()
+        self.output_dir = absolute(self.output_dir)
 
     def _follow(self, run: Path) -> None:
         """Set each `auto` of a resumed run to what it resolved to when the run began."""
@@ -176,12 +176,14 @@ class Lang3DXLTrainerConfig(RunConfig):
                 setattr(owner, name, choice)
 
 
-def read_config(path: Path) -> TrainerConfig:
+def read_config(path: Path) -> Lang3DXLTrainerConfig:
     """Read the configuration of a run as `read_settings` does. Raises UserError for a missing or damaged
-    file, one of another version, and one that requests more."""
+    file, one of another version or method, and one that requests more."""
     (config,) = read_settings(path, [()])
     if not isinstance(config, TrainerConfig):
         raise no_config(path)
+    if not isinstance(config, Lang3DXLTrainerConfig):
+        raise UserError(f"{path} is a run of another method: use nerfstudio's own commands, or pass another")
     return config
 
 
@@ -192,8 +194,6 @@ def open_run(run: str | Path | None) -> tuple[Lang3DXLTrainerConfig, Lang3DXLPip
     a checkpoint that is missing, damaged, or does not match the settings."""
     config_path = find_config(run).absolute()
     config = read_config(config_path)
-    if not isinstance(config, Lang3DXLTrainerConfig):
-        raise UserError(f"{config_path} is a run of another method: use nerfstudio's own commands")
     folder = config_path.parent
     path, state = latest_checkpoint(folder / config.relative_model_dir)
     # The folder may have moved; nerfstudio composes its path from these settings.
@@ -208,4 +208,4 @@ def open_run(run: str | Path | None) -> tuple[Lang3DXLTrainerConfig, Lang3DXLPip
 
 
 def _absolute(path: Path | None) -> Path | None:
-    return None if path is None else expanded(path).absolute()
+    return None if path is None else absolute(path)

@@ -45,10 +45,12 @@ def with_foreground(
     cache_dir: Path,
     device: torch.device | str,
     log: Log = print,
+    follow_links: bool = False,
 ) -> list[Photo]:
-    """Return the photos with the masks configured in `config.foreground` (a folder is relative to `data`),
-    and log the photos without one. Raises UserError if a folder is missing or matches no photo, if masks are
-    damaged or all dark, and if a model can't be loaded."""
+    """Return the photos with the masks configured in `config.foreground` (a folder is relative to `data`, and
+    with `follow_links` its masks may be links out of it), and log the photos without one. Raises UserError if
+    a folder is missing or matches no photo, if masks are damaged or all dark, and if a model can't be
+    loaded."""
     if config.foreground == "none":
         return [replace(photo, mask_path=None) for photo in photos]
     if config.foreground == "text":
@@ -57,7 +59,7 @@ def with_foreground(
         masked = list(photos)  # with the masks found by the dataparser
     else:
         folder = named_folder(config.foreground, data, "foreground")
-        masks = MaskFolder(folder)
+        masks = MaskFolder(folder, follow_links)
         masked = [replace(photo, mask_path=masks.find(photo.name)) for photo in photos]
         if all(photo.mask_path is None for photo in masked):
             raise UserError(

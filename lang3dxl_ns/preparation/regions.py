@@ -57,10 +57,11 @@ class RegionSource(Protocol):
         """Label `image`, the photo as read by `photo.read()`, at any size; negative for no region."""
 
 
-def region_source(config: PreparationConfig, data: Path) -> RegionSource | None:
+def region_source(config: PreparationConfig, data: Path, follow_links: bool = False) -> RegionSource | None:
     """Create the source that `config.regions` names; None for "none", or "auto" without a folder regions/. A
-    folder is relative to `data`. Raises UserError if it does not exist, or a network can't be found or
-    downloaded, or is no SAM 3 where prompts name the regions."""
+    folder is relative to `data`, and with `follow_links` its maps may be links out of it. Raises UserError if
+    it does not exist, or a network can't be found or downloaded, or is no SAM 3 where prompts name the
+    regions."""
     choice = config.regions
     if choice == "none" or (choice == "auto" and not (data / "regions").is_dir()):
         return None
@@ -79,7 +80,8 @@ def region_source(config: PreparationConfig, data: Path) -> RegionSource | None:
             )
         load = partial(_masks_of_instances, found.words, prompts)
         return MaskRegions(load, regions="text", prompts=prompts, model=found.identity)
-    return FolderRegions(data / "regions" if choice == "auto" else named_folder(choice, data, "regions"))
+    folder = data / "regions" if choice == "auto" else named_folder(choice, data, "regions")
+    return FolderRegions(folder, follow_links)
 
 
 class FelzenszwalbRegions:
@@ -132,12 +134,12 @@ def _masks_of_instances(files: ModelFiles, prompts: Sequence[str], device: torch
 class FolderRegions:
     """Regions from the user's label maps, drawn on the photos' files at any size and named like them."""
 
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
+    def __init__(self, folder: Path, follow_links: bool = False) -> None:
+        self._find = partial(companion, folder, suffixes=LABEL_SUFFIXES, follow_links=follow_links)
 
     def settings(self, photo: Photo) -> dict[str, Any] | None:
         """Return a hash of the photo's label map; None for a photo without one."""
-        path = companion(self._folder, photo.name, LABEL_SUFFIXES)
+        path = self._find(photo.name)
         if path is None:
             return None
         digest = hashlib.blake2b(path.read_bytes(), digest_size=16).hexdigest()
@@ -145,7 +147,7 @@ class FolderRegions:
 
     def labels(self, photo: Photo, image: Float[Tensor, "h w 3"]) -> Int[Tensor, "hl wl"]:
         """Read and undistort the photo's label map. Raises UserError for a file that is not a label map."""
-        path = companion(self._folder, photo.name, LABEL_SUFFIXES)
+        path = self._find(photo.name)
         assert path is not None, "settings() found it"
         return photo.undistort_labels(_numbered(_read_labels(path, photo.name)))
 

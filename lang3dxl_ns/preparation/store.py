@@ -105,11 +105,6 @@ class FeatureStore:
                 )
             return {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 (not a dict)
 
-    def shapes(self, kind: str, name: str) -> dict[str, tuple[int, ...]]:
-        """Read the shapes of an entry's tensors from its header alone. Raises UserError like `read`."""
-        with _opened(self.path(kind, name), f"{kind} of {name}") as file:
-            return {key: tuple(file.get_slice(key).get_shape()) for key in file.keys()}  # noqa: SIM118
-
     def is_current(self, kind: str, name: str, settings: dict[str, Any]) -> bool:
         """Return whether the entry exists, matches its checksum, and was made with these settings. A damaged
         one counts as absent."""
@@ -119,7 +114,7 @@ class FeatureStore:
         try:
             with _opened(path, f"{kind} of {name}") as file:
                 metadata = file.metadata()
-                if _canonical(json.loads(metadata["settings"])) != _canonical(settings):
+                if metadata["settings"] != _canonical(settings):
                     return False
                 tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
                 if metadata.get("checksum") != hash_tensors(hashlib.blake2b(digest_size=16), tensors):

@@ -16,6 +16,9 @@ from lang3dxl_ns.preparation.pyramid import ClipTarget
 from lang3dxl_ns.preparation.store import FeatureStore, PhotosGoneError
 
 CLIP, FINE, DENSE, REGIONS = "clip", "clip_fine", "dense", "regions"
+_OF_CLIP = {"features": 3, "valid": 2}
+_DIMENSIONS = {CLIP: _OF_CLIP, FINE: _OF_CLIP, DENSE: {"features": 3}, REGIONS: {"labels": 2}}
+"""Dimensions of a target's tensors, by kind."""
 
 _STD_FLOOR = 0.01
 FACTS = "lang3dxl"
@@ -55,10 +58,10 @@ class TargetReader:
 
     def __init__(self, store: FeatureStore, made_with: Mapping[str, Mapping[str, dict[str, Any]]]) -> None:
         self.names, self._made_with = list(made_with), made_with
-        self._store, first = store, self.names[0]
-        self.clip_dim: int = store.shapes(self._clip_kind(first), first)["features"][-1]
-        dense = next((name for name in self.names if DENSE in made_with[name]), None)
-        self.dense_dim: int = 0 if dense is None else store.shapes(DENSE, dense)["features"][-1]
+        self._store = store
+        self.clip_dim: int = self.clip(self.names[0]).features.shape[-1]
+        dense = next((found for name in self.names if (found := self.dense(name)) is not None), None)
+        self.dense_dim: int = 0 if dense is None else dense.shape[-1]
 
     def _settings(self, name: str) -> Mapping[str, dict[str, Any]]:
         if name not in self._made_with:
@@ -69,7 +72,11 @@ class TargetReader:
         return FINE if FINE in self._settings(name) else CLIP
 
     def _read(self, kind: str, name: str) -> dict[str, Tensor]:
-        return self._store.read(kind, name, self._made_with[name][kind])
+        found = self._store.read(kind, name, self._made_with[name][kind])
+        if {key: value.ndim for key, value in found.items()} != _DIMENSIONS[kind]:
+            path = self._store.path(kind, name)
+            raise UserError(f"{path} holds no target of this kind: delete it; run `lang3dxl prepare`")
+        return found
 
     def clip(self, name: str) -> StoredClipTarget:
         """Read a photo's CLIP target."""

@@ -18,12 +18,13 @@ from jaxtyping import Float32, Float64, UInt8
 from numpy import ndarray as Array
 from torch import Tensor
 
+from lang3dxl_ns.common.checks import check_numbers
 from lang3dxl_ns.common.console import say, some
 from lang3dxl_ns.common.errors import UserError, printable, readable
-from lang3dxl_ns.common.files import expanded, read_names
+from lang3dxl_ns.common.files import absolute, expanded, read_names
 from lang3dxl_ns.common.options import capture_option
 from lang3dxl_ns.scene.camera import camera_to_world, view_matrix
-from lang3dxl_ns.scene.capture_settings import CaptureSettings
+from lang3dxl_ns.scene.capture_settings import CAPTURE_BOUNDS, CaptureSettings
 from lang3dxl_ns.scene.colmap import Reconstruction, TrackedPhoto, photos_in_model, read_reconstruction
 from lang3dxl_ns.scene.companions import cache_folder, inside, is_inside
 from lang3dxl_ns.scene.frame import COLMAP_UP, Frame, find_frame, lost_cameras, no_scene
@@ -129,7 +130,8 @@ class Capture:
     def _named(self, path: Path) -> frozenset[str]:
         """Read a list of photos. Raises UserError for an unknown one."""
         with readable(f"{path} can't be used", "correct the list"):
-            return listed(read_names(path), {*self.names, *self.left_out}, "it")
+            known = {*self.names, *self.left_out}
+            return listed(read_names(path, known=known), known, "it")
 
     def _split_by_rule(self) -> Split:
         sure, every = self.sure, self.settings.eval_interval
@@ -208,6 +210,7 @@ def open_capture(
         damaged.
     """
     settings = settings or CaptureSettings()
+    check_numbers(settings, CAPTURE_BOUNDS)
     folder, source = find_source(data, settings, cache_dir, may_reconstruct)
     if source.suffix == ".json":
         capture = _of_transforms(source, settings)
@@ -238,7 +241,7 @@ def find_source(
     earlier reconstruction or transforms.json in the folder, or in the scene that the folder is a part of.
     Raises UserError as `open_capture` does.
     """
-    folder = _with_frames(expanded(data).absolute(), may_reconstruct)
+    folder = _with_frames(absolute(data), may_reconstruct)
     if folder.suffix == ".json" and folder.is_file():
         return folder.parent, folder
     check_data(folder)

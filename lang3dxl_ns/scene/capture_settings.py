@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+CAPTURE_BOUNDS = {"eval_interval": (2, 1e9), "scale_factor": (1e-9, 1e9)}
+"""Ranges of a capture's numbers: every photo can't be held out, and a scene has a size."""
 Orientation = Literal["up", "vertical", "none"]
 Center = Literal["poses", "none"]
 

@@ -22,7 +22,7 @@ import numpy as np
 from lang3dxl_ns.common.checks import check_numbers
 from lang3dxl_ns.common.console import progress, say, tracked
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.common.files import expanded, locked, replace_file
+from lang3dxl_ns.common.files import absolute, locked, replace_file
 from lang3dxl_ns.common.reports import timed
 from lang3dxl_ns.scene.camera_picture import camera_picture
 from lang3dxl_ns.scene.colmap import load_pycolmap
@@ -192,7 +192,7 @@ def reconstruct_scene(
     """Reconstruct a folder of photos or a video, and return the scene's folder and model: sparse/0 in it or,
     if sparse is taken or the folder is read-only, in the cache. Raises UserError as `reconstruct` does."""
     check_settings(settings or ReconstructionSettings())
-    data = expanded(data).absolute()
+    data = absolute(data)
     if is_video(data):
         data = extract_frames(data)
     photos = find_photos(data)

@@ -133,7 +133,8 @@ class TrainingData:
         """All photos by name, training photos first, with their foreground masks, which are made on first
         use."""
         folder, config = self.capture.folder, self.config
-        masked = with_foreground(self.as_read, config, folder, self.cache_dir, self.device, say)
+        links = self.capture.settings.follow_links
+        masked = with_foreground(self.as_read, config, folder, self.cache_dir, self.device, say, links)
         return {photo.name: photo for photo in masked}
 
     @cached_property
@@ -146,6 +147,11 @@ class TrainingData:
             name: PhotoCamera(pose, lens.matrix.float(), lens.width, lens.height, i if i < count else None)
             for i, (name, pose, lens) in enumerate(zip(names, poses, lenses, strict=True))
         }
+
+    @cached_property
+    def splits(self) -> dict[str, Literal["train", "eval"]]:
+        """Split of each photo by name, training photos first."""
+        return {name: "eval" if view.photo is None else "train" for name, view in self.views.items()}
 
     @cached_property
     def cameras(self) -> list[PhotoCamera]:
@@ -167,7 +173,7 @@ class TrainingData:
 
     @cached_property
     def _regions(self) -> RegionSource | None:
-        return region_source(self.config, self.capture.folder)
+        return region_source(self.config, self.capture.folder, self.capture.settings.follow_links)
 
     @cached_property
     def targets(self) -> TargetReader | None:
@@ -205,9 +211,8 @@ class TrainingData:
         described, doubts = [], self.capture.doubtful
         for name, view in self.views.items():
             pose = view.pose if run is None else run.pose(view)
-            split: Literal["train", "eval"] = "eval" if view.photo is None else "train"
-            doubt = doubts.get(name)
-            described.append(ScenePhoto.of(self.photos[name], split, pose.tolist(), self.scale, doubt))
+            photo, split = self.photos[name], self.splits[name]
+            described.append(ScenePhoto.of(photo, split, pose.tolist(), self.scale, doubts.get(name)))
         frame = self.capture.recorded_frame
         return SceneRecord(
             photos=described,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import zipfile
 from collections.abc import Mapping
 from contextlib import AbstractContextManager, suppress
 from pathlib import Path
@@ -15,13 +16,18 @@ from torch import Tensor
 from lang3dxl_ns.common.checks import expect
 from lang3dxl_ns.common.console import say, some
 from lang3dxl_ns.common.errors import DAMAGE, UserError, readable
-from lang3dxl_ns.common.files import check_regular, replace_durably
-from lang3dxl_ns.scene.record import SceneRecord
+from lang3dxl_ns.common.files import check_regular, locked, replace_durably
 
 CHECKPOINT = "training.ckpt"
 """Name of the checkpoint in a run's folder."""
 NOT_A_CHECKPOINT = (*DAMAGE, pickle.UnpicklingError)
 """Exceptions raised when a file that is not a checkpoint is read."""
+
+
+def alone_in(folder: Path) -> AbstractContextManager[None]:
+    """Hold a lock of a run's folder while training there. Raises UserError if another command does."""
+    # The folder's own lock is taken whenever its scene changes, also by words that are taught meanwhile.
+    return locked(folder / "training.lock", f"another command trains in {folder}: wait for it, or end it")
 
 
 def save_checkpoint(path: Path, content: Mapping[str, Any], partial: Path | None = None) -> None:
@@ -42,6 +48,17 @@ def save_checkpoint(path: Path, content: Mapping[str, Any], partial: Path | None
         ) from error
 
 
+def check_whole(path: Path) -> None:
+    """Verify a checkpoint's checksums, which torch doesn't. Raises one of `DAMAGE` for a file that is damaged
+    or packed: it might be far larger in memory."""
+    check_regular(path)
+    with zipfile.ZipFile(path) as archive:
+        packed = any(part.compress_type != zipfile.ZIP_STORED for part in archive.infolist())
+        expect(not packed, "packed, as torch writes none")
+        damaged = archive.testzip()
+        expect(damaged is None, f"{damaged} has another checksum")
+
+
 def load_checked(path: Path, tensors: str) -> dict[str, Any]:
     """Read a checkpoint's content on the CPU, without executing code. `tensors` is the name of the part that
     has the model's. Raises one of `NOT_A_CHECKPOINT` for a damaged or another file."""
@@ -60,28 +77,28 @@ def load_checked(path: Path, tensors: str) -> dict[str, Any]:
     return state
 
 
-def check_same_photos(path: Path, before: SceneRecord, now: SceneRecord, corrected: bool) -> None:
-    """Check that a checkpoint's photos are those of the run that is to go on, and say which ones moved
-    between the training and held-out sets.
+def check_same_photos(
+    path: Path, before: Mapping[str, str], now: Mapping[str, str], tensors: Mapping[str, Any]
+) -> None:
+    """Check that a checkpoint's training photos are those of the run that is to go on, and say which ones
+    moved between the training and held-out sets.
 
     Args:
         path: the checkpoint.
-        before: record of the run that it is of.
-        now: record of the run that is to go on.
-        corrected: whether it has corrections of each training photo's camera.
+        before: split of each photo, by name, of the run that it is of.
+        now: the same of the run that is to go on.
+        tensors: its tensors.
 
     Raises:
-        UserError: the cameras are in another frame, or the corrections are of other training photos.
+        UserError: it has corrections of each training photo's camera, and those are other photos.
     """
-    if not before.has_frame(now.frame):
-        raise UserError(f"{path} belongs to other photos or another reconstruction of them: train anew")
-    if corrected and before.trained != now.trained:
+    corrected = any(name.endswith("pose_adjustment") for name in tensors)
+    trained, trains = ([n for n, split in splits.items() if split == "train"] for splits in (before, now))
+    if corrected and trained != trains:
         raise UserError(
             f"{path} has corrections of other training photos' cameras: restore those, or train anew"
         )
-    splits = {photo.name: photo.split for photo in before.photos}
-    moved = [photo.name for photo in now.photos if splits.get(photo.name, photo.split) != photo.split]
-    if moved:
+    if moved := [name for name, split in now.items() if before.get(name, split) != split]:
         say(
             f"{len(moved)} photos moved between the training and held-out sets since this run began "
             f"({some(moved)}): metrics of held-out photos will be too good"
@@ -100,6 +117,7 @@ def read_checkpoint(path: Path, about: Mapping[str, Any]) -> dict[str, Any] | No
     if not path.exists():
         return None
     with as_damage(path):
+        check_whole(path)
         content = load_checked(path, "tensors")
         then = content["about"]  # of earlier versions, with fewer names
         changed = [name for name in about if name in then and about[name] != then[name]]

@@ -18,7 +18,7 @@ from lang3dxl_ns.common.checks import check_numbers
 from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.device import best_device
 from lang3dxl_ns.common.errors import UserError, in_a_line
-from lang3dxl_ns.common.files import expanded
+from lang3dxl_ns.common.files import expanded, replace_file
 from lang3dxl_ns.common.memory import ran_out_of_memory
 from lang3dxl_ns.common.stages import Stages
 from lang3dxl_ns.common.stopping import stoppable
@@ -26,17 +26,30 @@ from lang3dxl_ns.files.scene_file import SUFFIX, Provenance, replace_scene
 from lang3dxl_ns.preparation.model_files import check_encoders
 from lang3dxl_ns.preparation.needs import needs_table, write_needs
 from lang3dxl_ns.preparation.settings import PreparationConfig
+from lang3dxl_ns.preparation.store import PhotosGoneError
 from lang3dxl_ns.query.scene import Scene
 from lang3dxl_ns.scene.capture import Capture, open_capture, say_held_out, say_left_out
-from lang3dxl_ns.scene.capture_settings import CaptureSettings
+from lang3dxl_ns.scene.capture_settings import CAPTURE_BOUNDS, CaptureSettings
 from lang3dxl_ns.scene.companions import cache_folder
 from lang3dxl_ns.scene.photo_folder import check_data
 from lang3dxl_ns.scene.record import SCENE_FILE
 from lang3dxl_ns.training.batches import TrainingData, settled
-from lang3dxl_ns.training.checkpoint import CHECKPOINT, as_damage, read_checkpoint, save_checkpoint
+from lang3dxl_ns.training.checkpoint import (
+    CHECKPOINT,
+    alone_in,
+    as_damage,
+    check_same_photos,
+    read_checkpoint,
+    save_checkpoint,
+)
 from lang3dxl_ns.training.estimate import check_device, estimate
 from lang3dxl_ns.training.learn_codes import begin_codes, forget_words, learn_words
-from lang3dxl_ns.training.learning_rates import Rates, learning_rates, printed_learning_rates
+from lang3dxl_ns.training.learning_rates import (
+    Rates,
+    add_rows_to_state,
+    learning_rates,
+    printed_learning_rates,
+)
 from lang3dxl_ns.training.memory import out_of_memory, plan
 from lang3dxl_ns.training.scene_settings import PRINTED_PHOTO_SCALE, Method, RunSettings
 from lang3dxl_ns.training.settings import TrainingSettings, as_printed, without_effect
@@ -124,6 +137,7 @@ class Settings(RunSettings):
         """Check all settings, and return them with the values that depend on the length of the run. Raises
         UserError for a setting that is out of its range."""
         check_numbers(self, _BOUNDS)
+        check_numbers(self.capture, CAPTURE_BOUNDS)
         self.scene.check()
         self.targets.check()
         scene, learned = self.scene.fitted(self.steps), self.scene.decoder.learns_from_renderings
@@ -144,7 +158,8 @@ class Run:
         learned, scale = settings.scene.decoder.learns_from_renderings, settings.photo_scale
         self.data = TrainingData(capture, settings.targets, cache_dir, device, learned, scale)
         self.path = folder / f"{capture.folder.name or 'scene'}{SUFFIX}"
-        self.start, self.words_are_learned, self.title = 0, False, self.path.stem
+        self.done, self.words_are_learned, self.title = 0, False, self.path.stem
+        self.again = "the same command"
         facts = self.data.facts()
         say(needs_table(self.data.needs))
         torch.manual_seed(settings.seed)
@@ -196,6 +211,7 @@ class Run:
             "tensors": self.state.tensors(),
             "optimizers": {name: o.state_dict() for name, o in self.optimizers.items()},
             "schedulers": {name: s.state_dict() for name, s in self.schedulers.items()},
+            "splits": self.data.splits,
             "run": self.state.progress() | {"photos": self.data.state()},
             "words": self.words_are_learned,
         }
@@ -209,64 +225,77 @@ class Run:
         if (saved := read_checkpoint(path, self.about)) is None:
             return
         with as_damage(path):
-            self.start, self.words_are_learned = saved["step"] + 1, saved["words"]
+            splits = self.data.splits  # which earlier versions didn't save
+            check_same_photos(path, saved.get("splits", splits), splits, saved["tensors"])
+            self.done, self.words_are_learned = saved["step"] + 1, saved["words"]
             self.state.load(saved["tensors"])
             for name, content in saved["optimizers"].items():
                 self.optimizers[name].load_state_dict(content)
+                add_rows_to_state(self.optimizers[name])
             for name, content in saved["schedulers"].items():
                 self.schedulers[name].load_state_dict(content)
             self.data.restore(saved["run"]["photos"])
             self.state.restore(saved["run"])
         self.state.step = saved["step"]
-        if self.start < self.settings.steps:
+        if self.done < self.settings.steps:
             forget_words(self.state)
-        say(f"Resuming at iteration {self.start} of {self.settings.steps}")
+        say(f"Resuming at iteration {self.done} of {self.settings.steps}")
 
     @property
     def is_finished(self) -> bool:
         """Whether all iterations are done, and the words are learned."""
         words = self.words_are_learned or not self.state.learns_words_at_the_end
-        return self.start >= self.settings.steps and words
+        return self.done >= self.settings.steps and words
 
     def complete(self, stages: Stages) -> Scene:
         """Do what is left: iterations, then words. Raises as `fit`."""
         if self.is_finished and self.path.exists():
             say("The run is finished already")
             return self.scene()
+        first, steps = self.done, self.settings.steps
         try:
             self._train(stages)
             if self.state.learns_words_at_the_end and not self.words_are_learned:
                 self._end_with_words(stages)
+        except PhotosGoneError as error:
+            if first < self.done < steps:
+                self.save(self.done - 1)
+            raise UserError(f"{error}. To resume: {self.again}") from error
         except (RuntimeError, MemoryError) as error:
             if not ran_out_of_memory(error):
                 raise
             kept = self.folder / CHECKPOINT
-            told = f"{kept} is kept: the same command resumes there" if kept.exists() else "none is saved yet"
-            when = f"at iteration {self.state.step}"
+            told = f"{kept} is kept: {self.again} resumes there" if kept.exists() else "none is saved yet"
+            when = f"at iteration {self.done}" if self.done < steps else "while learning words"
             raise UserError(out_of_memory(len(self.state.means), when, "--photo-scale 0.5", told)) from error
         if summary := self.guard.summary():
             say(summary)
-        return self.save(self.settings.steps - 1)
+        return self.save(steps - 1)
 
     def _train(self, stages: Stages) -> None:
         """Do the iterations that are left, with a checkpoint now and then and after the last one."""
-        steps, asked = self.settings.steps, threading.Event()
+        first, steps, asked = self.done, self.settings.steps, threading.Event()
         every = min(self.settings.save_every, max(steps // 4, 1))
-        if self.start < steps:
-            line, words = estimate(self.state, self.data.cameras, steps - self.start)
+        if first < steps:
+            line, words = estimate(self.state, self.data.cameras, steps - first)
             stages.weigh("words", "train", words)
             say(line)
         with stages.stage("train"), stoppable(lambda _: asked.set()):
-            for step in range(self.start, steps):
+            for step in range(first, steps):
                 self.iterate(step)
-                done = (step + 1 - self.start) / (steps - self.start)
-                stages.progress(done, f"{len(self.state.means):,} Gaussians")
-                ends = step == steps - 1  # with a checkpoint only if words follow
-                due = self.state.learns_words_at_the_end if ends else (step + 1) % every == 0
+                self.done = step + 1
+                stages.progress((self.done - first) / (steps - first), f"{len(self.state.means):,} Gaussians")
+                ends = self.done == steps  # with a checkpoint only if words follow
+                due = self.state.learns_words_at_the_end if ends else self.done % every == 0
                 if asked.is_set() or due:
-                    self.save(step)
+                    try:
+                        self.save(step)
+                    except (OSError, UserError) as error:
+                        if asked.is_set() or ends:
+                            raise
+                        say(f"{error}. Training continues.")
                 if asked.is_set():
-                    say(f"Stopped after {step + 1} iterations. To resume: the same command")
+                    say(f"Stopped after {self.done} iterations. To resume: {self.again}")
                     raise KeyboardInterrupt
 
     def _end_with_words(self, stages: Stages) -> None:
@@ -275,7 +304,7 @@ class Run:
             with stages.stage("words"):
                 learn_words(self.state, self.data)
         except KeyboardInterrupt:
-            say("Stopped while words were learned; all iterations are kept. To resume: the same command")
+            say(f"Stopped while words were learned; all iterations are kept. To resume: {self.again}")
             raise
         self.words_are_learned = True
 
@@ -295,25 +324,49 @@ def _about(settings: Settings, capture: Capture) -> dict[str, Any]:
     return told | {"photos": photos}
 
 
-def begin(capture: Capture, settings: Settings, out: Path, cache_dir: Path, device: str | None = None) -> Run:
+def begin(
+    capture: Capture,
+    settings: Settings,
+    out: Path,
+    cache_dir: Path,
+    device: str | None = None,
+    restart: bool = False,
+) -> Run:
     """Prepare a run, or the continuation of the folder's; see `fit`."""
     # A group without gradients so far has a schedule all the same.
     warnings.filterwarnings("ignore", "Detected call of .lr_scheduler.step")
-    settings = settings.resolved()
     device = device or best_device()
-    check_device(device, settings.scene.rasterizer)
-    if settings.mixed_precision and not (device.startswith("cuda") and torch.cuda.is_bf16_supported(False)):
-        raise UserError("--mixed-precision needs a GPU that multiplies bfloat16 (since Ampere): leave it off")
-    out.mkdir(parents=True, exist_ok=True)
+    settings = _resolved(settings, device)
+    replace_file(trial := out / "training.trial", b"")  # the folder may be another user's
+    trial.unlink()
     torch.manual_seed(settings.seed)
     run = Run(capture, settings, out, cache_dir, device)
+    if restart:  # now that nothing is in its way
+        (out / CHECKPOINT).unlink(missing_ok=True)
+        run.again = "the same command without --restart"
     run.resume()
     run.data.record(run.state).write(out / SCENE_FILE)
     write_needs(run.data.needs, out)
     return run
 
 
-def fit(capture: Capture, settings: Settings, out: Path, cache_dir: Path, device: str | None = None) -> Scene:
+def _resolved(settings: Settings, device: str) -> Settings:
+    """Return `Settings.resolved`. Raises UserError also for what the device can't do."""
+    settings = settings.resolved()
+    check_device(device, settings.scene.rasterizer)
+    if settings.mixed_precision and not (device.startswith("cuda") and torch.cuda.is_bf16_supported(False)):
+        raise UserError("--mixed-precision needs a GPU that multiplies bfloat16 (since Ampere): leave it off")
+    return settings
+
+
+def fit(
+    capture: Capture,
+    settings: Settings,
+    out: Path,
+    cache_dir: Path,
+    device: str | None = None,
+    restart: bool = False,
+) -> Scene:
     """Train a scene, or go on with the run in a folder.
 
     Args:
@@ -323,15 +376,18 @@ def fit(capture: Capture, settings: Settings, out: Path, cache_dir: Path, device
             the photos and of what they need.
         cache_dir: folder of prepared targets.
         device: by default a GPU if there is one.
+        restart: whether to forget the folder's run.
 
     Raises:
-        UserError: the photos or settings cannot be used, or the folder's run is another one.
+        UserError: the photos or settings cannot be used, another command trains in the folder, or its run is
+            another one.
         KeyboardInterrupt: Ctrl-C or SIGTERM stopped the run, after a checkpoint.
     """
     stages = Stages({"prepare": 0.3, "train": 0.6, "words": 0.1})
-    with stages.stage("prepare"):
-        run = begin(capture, settings, out, cache_dir, device)
-    return run.complete(stages)
+    with alone_in(out):
+        with stages.stage("prepare"):
+            run = begin(capture, settings, out, cache_dir, device, restart)
+        return run.complete(stages)
 
 
 def run_folder(
@@ -340,16 +396,14 @@ def run_folder(
     """Open the capture in a folder, and train it as `fit`; return the folder of the run, by default
     outputs/NAME, and the scene. `restart` forgets the folder's run. Raises as `fit`."""
     check_data(expanded(data))
-    settings = settings.resolved()
+    settings = _resolved(settings, best_device())
     check_encoders(settings.targets.clip, settings.targets.dense)
     capture = open_capture(data, settings.capture, settings.targets.cache_dir)
     say_left_out(capture)
     say_held_out(capture)
     folder = Path("outputs") / (capture.folder.name or "scene") if out is None else expanded(out)
-    if restart:
-        (folder / CHECKPOINT).unlink(missing_ok=True)
     cache = cache_folder(capture.folder, settings.targets.cache_dir)
-    return folder, fit(capture, settings, folder, cache)
+    return folder, fit(capture, settings, folder, cache, restart=restart)
 
 
 def train(
@@ -382,4 +436,5 @@ def train(
     try:
         return run_folder(data, out, chosen, restart)[1]
     except KeyboardInterrupt as error:
-        raise UserError("training was stopped; to resume: the same call") from error
+        resuming = f"the same call{' without restart' if restart else ''}"
+        raise UserError(f"training was stopped; to resume: {resuming}") from error

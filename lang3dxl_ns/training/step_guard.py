@@ -52,7 +52,7 @@ class StepGuard:
         self._in_a_row += 1
         self._seen[photo, what] += 1
         if self._seen[photo, what] == 1:  # a broken photo recurs in every round
-            self._log(f"[yellow]Step {step} is skipped: photo {photo} gives no finite {what}")
+            self._log(f"Step {step} is skipped: photo {photo} gives no finite {what}")
         if self._in_a_row >= self.most_in_a_row:
             raise UserError(
                 f"{self._in_a_row} steps in a row had no finite loss or gradient (the last, step {step}, "

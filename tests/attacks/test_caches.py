@@ -1,8 +1,12 @@
 """Damaged caches of a scene and targets: made again, whatever the damage."""
 
+import pytest
 import torch
+from safetensors.torch import save_file
 
+from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.preparation.store import FeatureStore
+from lang3dxl_ns.preparation.targets import TargetReader
 from lang3dxl_ns.query.visibility import VisibleGaussians, load_visible, save_visible
 from lang3dxl_ns.scene.camera import Lens
 
@@ -40,3 +44,20 @@ def test_a_target_whose_settings_are_lost_or_altered_counts_as_absent(tmp_path):
         assert damage[0] in whole
         path.write_bytes(whole.replace(*damage))
         assert not store.is_current("clip", "a.jpg", made_with)
+
+
+def test_a_target_of_settings_that_nest_without_end_counts_as_absent(tmp_path):
+    store = FeatureStore(tmp_path)
+    (path := store.path("clip", "a.jpg")).parent.mkdir()
+    save_file({"features": torch.zeros(2)}, path, {"settings": "[" * 100_000})
+    assert not store.is_current("clip", "a.jpg", {})
+
+
+@pytest.mark.parametrize(
+    "tensors", [{"other": torch.zeros(2)}, {"features": torch.ones(4), "valid": torch.ones(4)}]
+)
+def test_a_target_with_the_checksum_but_not_the_parts_of_its_kind_is_named(tmp_path, tensors):
+    store, made_with = FeatureStore(tmp_path), {"size": [4, 4], "crop_sides": [2]}
+    store.write("clip", "a.jpg", tensors, made_with)
+    with pytest.raises(UserError, match=r"a\.jpg.* holds no target of this kind: delete it"):
+        TargetReader(store, {"a.jpg": {"clip": made_with}})

@@ -5,6 +5,7 @@ import math
 import os
 import shutil
 import zipfile
+from copy import deepcopy
 
 import pytest
 import torch
@@ -13,6 +14,7 @@ from nerfstudio.configs.method_configs import all_methods
 
 from lang3dxl_ns.cli import main
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.components.downsampler import DownsamplerConfig
 from lang3dxl_ns.methods import lang3dxl
 from lang3dxl_ns.open_scene import load_scene
 from lang3dxl_ns.plugin.run_checkpoint import read_checkpoint
@@ -263,7 +265,9 @@ def test_a_checkpoint_that_would_fill_the_memory_is_refused(copy):
 
 def test_the_config_of_another_method_is_named(copy):
     (copy / "config.yml").write_text(yaml.dump(all_methods["splatfacto"]))
-    for opening in (load_scene, open_run):
+    config = deepcopy(lang3dxl.config)
+    config.load_dir, config.data, config.output_dir = copy / "nerfstudio_models", copy, copy / "outputs"
+    for opening in (load_scene, open_run, lambda _: config.set_timestamp()):
         with pytest.raises(UserError, match="another method"):
             opening(copy / "config.yml")
 
@@ -306,6 +310,29 @@ def test_photos_that_may_not_be_read_are_not_taken_for_gone(copy, monkeypatch):
     monkeypatch.setattr("lang3dxl_ns.plugin.dataparser.open_capture", refused)
     with pytest.raises(PermissionError):
         open_run(copy / "config.yml")
+
+
+def test_a_part_of_other_settings_is_named(tmp_path):
+    config = deepcopy(lang3dxl.config)
+    config.pipeline.model.semantic_field = DownsamplerConfig()
+    (tmp_path / "config.yml").write_text(yaml.dump(config))
+    with pytest.raises(UserError, match=r"sets pipeline\.model\.semantic_field to Downsampler"):
+        read_config(tmp_path / "config.yml")
+
+
+@pytest.mark.parametrize(
+    "setting", ["    sh_degree: 3", "_target: !!python/name:lang3dxl_ns.plugin.trainer.Lang3DXLTrainer ''"]
+)
+def test_a_setting_of_a_million_values_is_told_in_a_line(tmp_path, setting):
+    """Six levels of aliases, each ten times the one before, are a few bytes of a file."""
+    levels = [f"&a{i} [{', '.join(10 * [f'*a{i - 1}'])}]" for i in range(1, 7)]
+    text = yaml.dump(lang3dxl.config)
+    assert setting in text
+    many = f"{setting.partition(':')[0]}: [&a0 x, {', '.join(levels)}]"
+    (tmp_path / "config.yml").write_text(text.replace(setting, many))
+    with pytest.raises(UserError) as error:
+        read_config(tmp_path / "config.yml")
+    assert setting.partition(":")[0].strip() in str(error.value) and len(str(error.value)) < 500
 
 
 @pytest.mark.parametrize(

@@ -49,6 +49,7 @@ SETTINGS = [
     *((f"{DATA}cache_gb", value) for value in (-1.0, math.nan)),
     *((f"{DATA}read_ahead", -3), (f"{DATA}crop_batch", 0)),
     *((f"{DATA}dataparser.scale_factor", 0.0), (f"{DATA}dataparser.scene_scale", math.nan)),
+    (f"{DATA}dataparser.eval_interval", 0),
     *(("machine.seed", -1), ("max_num_iterations", 0)),
     *((f"{MODEL}sky_gaussians", value) for value in (-5, 1e12)),
     *((f"{MODEL}sh_degree", value) for value in (-1, 4)),

@@ -207,6 +207,22 @@ def test_what_is_no_scene_of_ours_is_kept_beside_the_new_one(tmp_path, content, 
     assert set_aside(path).name == "a.scene.old2"
 
 
+def test_words_that_a_scene_without_words_replaces_wait_in_it_or_are_kept_beside_it(tmp_path, word, capsys):
+    """A training's scene has only colors until its end; one without a CLIP has them for good."""
+    path, whole = tmp_path / "a.scene", stored_scene()
+    write_scene(path, whole.with_words([word]))
+    so_far = painted_scene(decoder=None, codes=None)
+    for _ in range(2):
+        replace_scene(path, so_far, Provenance())
+        assert list(read_scene(path, "cpu").words) == ["gizmo"]
+    replace_scene(path, whole, Provenance())
+    assert list(read_scene(path, "cpu").words) == ["gizmo"] and not list(tmp_path.glob("*.json"))
+    colors = painted_scene(decoder=None, codes=None, file=replace(whole.file, clip=None, clip_identity=None))
+    replace_scene(path, colors, Provenance())
+    assert [kept.name for kept in load_words(tmp_path / "a.gizmo.json")] == ["gizmo"]
+    assert "is lost" in (said := capsys.readouterr().out) and f"kept in {tmp_path / 'a.gizmo.json'}" in said
+
+
 def test_a_lock_is_the_files_whichever_link_names_it(tmp_path):
     (tmp_path / "real").mkdir()
     (tmp_path / "real" / "a.scene").touch()

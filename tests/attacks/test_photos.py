@@ -27,6 +27,7 @@ from lang3dxl_ns.scene.colmap import read_reconstruction
 from lang3dxl_ns.scene.companions import companion, inside
 from lang3dxl_ns.scene.photo_folder import find_photos, readable, shared_cameras
 from lang3dxl_ns.scene.video import extract_frames
+from lang3dxl_ns.training.checkpoint import alone_in
 
 EPS = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 96 72\n%%EndComments\n(trap) run\n%%EOF\n"
 
@@ -282,6 +283,13 @@ def test_photos_that_vanish_end_the_training_with_a_checkpoint_and_no_scene(trai
         trainer.train()
     assert [path.name for path in trainer.checkpoint_dir.iterdir()][-1:] == ["step-000000010.ckpt"]
     assert not list(trainer.base_dir.glob("*.scene"))
+
+
+def test_a_run_that_another_command_trains_is_left_alone(training):
+    trainer, _ = training
+    with alone_in(trainer.base_dir), pytest.raises(UserError, match="another command trains in"):
+        trainer.train()
+    assert not list(trainer.checkpoint_dir.glob("*.ckpt"))
 
 
 def test_photos_that_come_back_are_waited_for(training, tmp_path, monkeypatch, capsys):

@@ -52,6 +52,13 @@ def parsed(*words) -> Settings:
     return cli._parsed(["train", "photos", *words]).settings()
 
 
+@pytest.mark.parametrize("words", [["--method"], ["--method", "--steps", "5"]])
+def test_a_method_without_its_name_is_told(words, capsys):
+    with pytest.raises(SystemExit):
+        parsed(*words)
+    assert "--method" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("method", ["lang3dxl", "lang3dxl-paper"])
 def test_the_command_alone_has_a_methods_usual_settings(method):
     found, usual = parsed("--method", method), Settings.of(method)
@@ -89,6 +96,8 @@ def test_photos_are_found_and_held_out_as_the_options_say(tmp_path):
         (["--steps", "0"], "--steps is 0: give a number from 1"),
         (["--photo-scale", "0"], "--photo-scale is 0"),
         (["--save-every", "0"], "--save-every is 0"),
+        (["--scale-factor", "nan"], "--scale-factor is nan"),
+        (["--eval-interval", "1"], "--eval-interval is 1: give a number from 2"),
         (["--clip-weight", "7"], "--clip-weight has no effect .* --method lang3dxl-paper"),
         (["--regions", "felzenszwalb"], "--regions has no effect"),
     ],
@@ -131,9 +140,10 @@ def test_settings_from_python_reach_the_run(monkeypatch, tmp_path):
 def test_ctrl_c_from_python_is_the_error_that_it_promises(tmp_path, monkeypatch):
     data = write_scene(tmp_path / "scene", photos=4, points=60)
 
-    def interrupted(*_):
+    def interrupted(*_, **__):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(fitting, "fit", interrupted)
-    with pytest.raises(UserError, match="training was stopped; to resume"):
-        lang3dxl_ns.train(data, tmp_path / "run", steps=6, clip="none")
+    for restart, told in ((False, "the same call$"), (True, "the same call without restart$")):
+        with pytest.raises(UserError, match=f"training was stopped; to resume: {told}"):
+            lang3dxl_ns.train(data, tmp_path / "run", steps=6, clip="none", restart=restart)

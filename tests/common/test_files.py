@@ -2,10 +2,17 @@
 
 import errno
 import os
+from functools import partial
 
 import pytest
 
-from lang3dxl_ns.common.files import replace_durably, write_atomically
+from lang3dxl_ns.common.checks import disk_trouble
+from lang3dxl_ns.common.files import file_locked, replace_durably, set_aside, write_atomically
+
+
+def lock(path):
+    with file_locked(path):
+        pass
 
 
 def test_a_failed_write_leaves_the_old_file_and_no_temporary(tmp_path, monkeypatch):
@@ -48,3 +55,13 @@ def test_a_device_or_a_pipe_is_written_to_and_a_link_stays_a_link(tmp_path):
     assert (tmp_path / "target").read_text() == "words"
     with pytest.raises(IsADirectoryError):
         write_atomically(tmp_path, "words")
+
+
+@pytest.mark.parametrize("change", [partial(write_atomically, content=""), set_aside, lock])
+def test_links_in_a_circle_are_told_with_what_helps_and_stay(tmp_path, change):
+    (tmp_path / "a").symlink_to(tmp_path / "b")
+    (tmp_path / "b").symlink_to(tmp_path / "a")
+    with pytest.raises(OSError, match="symbolic links") as error:
+        change(tmp_path / "a")
+    assert "remove them" in disk_trouble(error.value)
+    assert (tmp_path / "a").is_symlink() and (tmp_path / "b").is_symlink()

@@ -19,6 +19,7 @@ from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import locked
 from lang3dxl_ns.plugin.datamanager import Lang3DXLDataManagerConfig
 from lang3dxl_ns.plugin.dataparser import PhotoCollectionDataParserConfig, parser_for
+from lang3dxl_ns.scene.capture import Capture
 from lang3dxl_ns.scene.layout import images_folder
 from lang3dxl_ns.scene.video import _looks, _sharpest, _write, extract_frames
 
@@ -38,9 +39,12 @@ def datamanager(data, **changes):
     return config.setup(device="cpu", test_mode="val")
 
 
-def test_photos_that_are_held_out_are_told(tmp_path, capsys):
+def test_photos_that_are_held_out_are_told(tmp_path, capsys, monkeypatch):
     datamanager(write_scene(tmp_path / "scene", photos=3))
     assert "1 of 3 photos are held out of training" in " ".join(capsys.readouterr().out.split())
+    monkeypatch.setattr(Capture, "contradicted", {"photo_001.jpg": "its matches"})  # in neither split
+    datamanager(tmp_path / "scene", dataparser=PhotoCollectionDataParserConfig(eval_mode="all"))
+    assert "held out" not in capsys.readouterr().out
 
 
 def test_a_flat_folder_of_photos_is_all_that_training_needs(walk, tmp_path):

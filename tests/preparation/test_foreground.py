@@ -83,6 +83,17 @@ def test_a_folder_gives_masks_of_any_size_and_the_log_names_photos_without(photo
     assert lines == ["1 of 3 photos have no mask and are used whole: north/b.png"]
 
 
+def test_masks_are_links_out_of_their_folder_only_where_links_are_followed(photos, tmp_path):
+    make_mask(tmp_path / "elsewhere" / "c.png")
+    (tmp_path / "kept").mkdir()
+    (tmp_path / "kept" / "c.png").symlink_to(tmp_path / "elsewhere" / "c.png")
+    config = PreparationConfig(foreground="kept")
+    with pytest.raises(UserError, match="leads out of"):
+        run(photos, config, tmp_path)
+    masked = with_foreground(photos, config, tmp_path, tmp_path / "cache", "cpu", print, follow_links=True)
+    assert [photo.mask_path is None for photo in masked] == [True, True, False]
+
+
 def test_auto_keeps_what_the_data_has_and_none_drops_it(photos, tmp_path):
     make_mask(tmp_path / "masks" / "c.png")
     found = [replace(photo, mask_path=MaskFolder(tmp_path / "masks").find(photo.name)) for photo in photos]

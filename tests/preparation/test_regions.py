@@ -156,6 +156,16 @@ def test_a_folders_settings_follow_the_file_and_are_none_without_one(tmp_path):
     json.dumps(first)
 
 
+def test_label_maps_are_links_out_of_their_folder_only_where_links_are_followed(tmp_path):
+    np.save(tmp_path / "a.npy", np.zeros((3, 4), int))
+    (folder := tmp_path / "labels" / "north").mkdir(parents=True)
+    (folder / "a.npy").symlink_to(tmp_path / "a.npy")
+    config = PreparationConfig(regions="labels")
+    with pytest.raises(UserError, match="leads out of"):
+        region_source(config, tmp_path).settings(PHOTO)
+    assert region_source(config, tmp_path, follow_links=True).settings(PHOTO)
+
+
 @pytest.mark.parametrize(
     ("file", "content"),
     [

@@ -584,6 +584,29 @@ def test_the_split_follows_the_rule(folder, settings, held_out):
     assert split.held_out == tuple(f"photo_{i:03d}.png" for i in held_out)
 
 
+@pytest.mark.parametrize("settings", [{"eval_interval": 0}, {"eval_interval": -2}, {"scale_factor": 0.0}])
+def test_numbers_that_make_no_scene_are_refused(folder, settings):
+    with pytest.raises(UserError, match="give a number from"):
+        open_capture(folder, CaptureSettings(**settings))
+
+
+def test_a_name_in_a_list_may_have_the_mark_of_comments(folder):
+    for old, new in (("photo_001.png", "#1 front.png"), ("photo_002.png", "photo #2.png")):
+        (folder / "images" / old).rename(folder / "images" / new)
+    as_text(folder, lambda lines: [
+        line.replace("photo_001", "#1 front").replace("photo_002", "photo #2") for line in lines
+    ])  # fmt: skip
+    (folder / "test_list.txt").write_text(
+        "#1 front.png\nphoto #2.png\nphoto_003.png # blurred\n# photo_004.png\n"
+    )
+    assert open_capture(folder).split.held_out == ("#1 front.png", "photo #2.png", "photo_003.png")
+
+
+def test_a_scene_has_its_folders_name_however_one_gets_there(folder, monkeypatch):
+    monkeypatch.chdir(folder / "images")
+    assert open_capture("..").folder.name == open_capture(folder).folder.name == folder.name
+
+
 def test_lists_of_a_folder_split_its_photos(folder):
     (folder / "train_list.txt").write_text("photo_001.png\nphoto_002.png\n")
     (folder / "test_list.txt").write_text("photo_003.png\n")

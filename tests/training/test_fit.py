@@ -1,10 +1,13 @@
 """`fit`: the same bytes as `ns-train`, also after a stop; what a run leaves in its folder."""
 
+import errno
 import io
 import os
 import re
+import shutil
 import signal
 from contextlib import redirect_stdout
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -13,12 +16,16 @@ import torch
 from scenes import write_scene
 
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.files import locked
+from lang3dxl_ns.common.stages import Stages
 from lang3dxl_ns.components.field_settings import SemanticFieldConfig
-from lang3dxl_ns.files.scene_file import read_scene
+from lang3dxl_ns.files.scene_file import keep_words, read_scene
+from lang3dxl_ns.preparation.store import PhotosGoneError
 from lang3dxl_ns.scene.capture import open_capture
 from lang3dxl_ns.training import fit as fitting
-from lang3dxl_ns.training.checkpoint import CHECKPOINT
+from lang3dxl_ns.training.checkpoint import CHECKPOINT, alone_in
 from lang3dxl_ns.training.fit import Run, Settings, begin, fit
+from lang3dxl_ns.words.taught_words import TaughtWord
 
 STEPS = 20
 GROWING = {"densify_grad_thresh": 1e-7, "densify_every": 0.2, "densify_until": 0.75}
@@ -126,17 +133,19 @@ def test_words_that_are_stopped_are_said_and_made_by_the_next_command(
 def test_a_full_memory_names_settings_that_help_and_the_checkpoint(data, settings, tmp_path, monkeypatch):
     iterate = Run.iterate
 
-    def full(self, step):
-        if step == 2:
-            raise RuntimeError("CUDA out of memory")
-        iterate(self, step)
+    def full(*_):
+        raise RuntimeError("CUDA out of memory")
 
-    monkeypatch.setattr(Run, "iterate", full)
+    monkeypatch.setattr(Run, "iterate", lambda self, step: full() if step == 2 else iterate(self, step))
     monkeypatch.setattr("sys.argv", ["lang3dxl"])
     said = (
-        r"at iteration 1 .* --max-gaussians \d+, --photo-scale 0.5, .*training.ckpt is kept: the same command"
+        r"at iteration 2 .* --max-gaussians \d+, --photo-scale 0.5, .*training.ckpt is kept: the same command"
     )
     with pytest.raises(UserError, match=said):
+        trained(data, tmp_path, settings(4))
+    monkeypatch.setattr(Run, "iterate", lambda *_: None)
+    monkeypatch.setattr(fitting, "learn_words", full)
+    with pytest.raises(UserError, match="while learning words"):
         trained(data, tmp_path, settings(4))
 
 
@@ -183,6 +192,109 @@ def test_mixed_precision_without_such_a_gpu_is_refused_before_anything_is_prepar
     assert not list(tmp_path.iterdir())
 
 
+def colors(settings, steps=8, **changes) -> Settings:
+    """Settings of a run without words."""
+    made = settings(steps, **changes)
+    made.targets.clip = "none"
+    return made
+
+
+def test_vanished_photos_and_a_full_disk_lose_no_iterations(data, settings, tmp_path, monkeypatch, capsys):
+    """A checkpoint comes every other iteration."""
+    iterate, save, full = Run.iterate, torch.save, [OSError(errno.ENOSPC, "No space left on device")]
+
+    def gone(self, step):
+        if step == 5:
+            raise PhotosGoneError("the photos have vanished")
+        iterate(self, step)
+
+    def saved(*arguments):
+        if full:
+            raise full.pop()
+        save(*arguments)
+
+    monkeypatch.setattr(Run, "iterate", gone)
+    monkeypatch.setattr(torch, "save", saved)
+    with pytest.raises(UserError, match=r"the photos have vanished\. To resume: the same command"):
+        trained(data, tmp_path, colors(settings))
+    assert torch.load(tmp_path / CHECKPOINT, weights_only=True)["step"] == 4
+    assert "No space left on device" in (said := capsys.readouterr().out) and "Training continues." in said
+
+
+def test_a_folder_that_can_not_be_written_to_is_told_before_the_work(data, settings, tmp_path, monkeypatch):
+    def refused(*_):
+        raise PermissionError(errno.EACCES, "Permission denied")
+
+    monkeypatch.setattr(os, "replace", refused)
+    monkeypatch.setattr(fitting, "Run", lambda *_: pytest.fail("begun"))
+    with pytest.raises(PermissionError, match=str(tmp_path)):
+        trained(data, tmp_path, colors(settings))
+
+
+def test_two_commands_do_not_train_in_one_folder_but_one_may_teach(data, settings, tmp_path):
+    with alone_in(tmp_path), pytest.raises(UserError, match="another command trains in"):
+        trained(data, tmp_path, colors(settings))
+    with alone_in(tmp_path), locked(tmp_path, busy="busy"):
+        pass
+
+
+def test_a_restart_forgets_the_earlier_run_once_nothing_is_in_its_way(data, settings, tmp_path, monkeypatch):
+    again = partial(begin, open_capture(data), colors(settings), tmp_path, data / "lang3dxl_cache", "cpu")
+    again().save(0)
+
+    def refused(*_):
+        raise UserError("too large")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(fitting, "plan", refused)
+        with pytest.raises(UserError, match="too large"):
+            again(restart=True)
+    assert again().done == 1
+    run = again(restart=True)
+    assert run.done == 0 and not (tmp_path / CHECKPOINT).exists()
+    assert run.again == "the same command without --restart"
+
+
+def test_a_run_goes_on_with_more_photos_but_corrects_no_others_cameras(data, settings, tmp_path, capsys):
+    def run_without(*held_out, look="off", **changes) -> Run:
+        (tmp_path / "list.txt").write_text("\n".join(f"photo_{i:03d}" for i in held_out))
+        made = colors(settings, **changes)
+        made.capture.held_out, made.scene.appearance.use = tmp_path / "list.txt", look
+        capture = open_capture(data, made.capture)
+        return begin(capture, made, tmp_path / look, data / "lang3dxl_cache", "cpu")
+
+    run = run_without(0, 1, look="on")
+    run.iterate(0)
+    run.save(0)
+    capsys.readouterr()
+    run = run_without(1, look="on")
+    assert "1 photos moved between the training and held-out sets" in capsys.readouterr().out
+    ((parameter, state),) = run.optimizers["appearance_vectors"].state.items()
+    assert len(parameter) == len(state["exp_avg"]) == 5
+    run_without(0, 1, camera_optimization="on").save(0)
+    with pytest.raises(UserError, match="corrections of other training photos' cameras"):
+        run_without(0, 2, camera_optimization="on")
+
+
+def test_a_taught_word_outlives_a_training_over_its_scene(data, settings, short, tmp_path):
+    shutil.copytree(short.out, tmp_path, dirs_exist_ok=True)
+    path, seen = tmp_path / "scene.scene", list[list[str]]()
+    scene = read_scene(path)
+    vector, clip = torch.ones(scene.decoder.clip_dim), scene.file.clip_identity
+    keep_words(path, {"gizmo": TaughtWord("gizmo", vector, 0.0, 0.0, 0.1, clip=clip)})
+    run = begin(open_capture(data), settings(4), tmp_path, data / "lang3dxl_cache", "cpu", restart=True)
+    save = run.save
+
+    def seen_after(step):
+        saved = save(step)
+        seen.append([*read_scene(path).words])
+        return saved
+
+    run.save = seen_after
+    assert run.complete(Stages({"train": 0.5, "words": 0.5})).words.keys() == {"gizmo"}
+    assert seen == [["gizmo"]] * 5
+
+
 def without(*places: str):
     """A change to a checkpoint's content that drops what a path of names leads to."""
 
@@ -221,6 +333,12 @@ def test_a_damaged_checkpoint_is_named_with_what_helps_and_a_full_memory_is_no_d
             begin(capture, settings(2), tmp_path, cache, "cpu")
         told = r"training\.ckpt can't be read .*: restore it, or delete it"
         assert re.search(told, str(error.value)), f"{kind}: {error.value}"
+    means = torch.load(io.BytesIO(whole), weights_only=True)["tensors"]["gauss_params.means"]
+    (tmp_path / CHECKPOINT).write_bytes(whole.replace(means.numpy().tobytes(), bytes(means.nbytes)))
+    with pytest.raises(UserError, match=r"training\.ckpt can't be read \(.* checksum\): restore it"):
+        begin(capture, settings(2), tmp_path, cache, "cpu")
+
+    (tmp_path / CHECKPOINT).write_bytes(whole)
 
     def full(*_, **__):
         raise RuntimeError("[enforce fail] DefaultCPUAllocator: can't allocate memory")

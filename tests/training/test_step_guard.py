@@ -25,7 +25,7 @@ def test_a_broken_gradient_is_refused_and_named(gradient):
     lines = []
     guard = StepGuard(5, lines.append)
     assert not guard.allows(7, "a.jpg", FINE, group(gradient))
-    assert all(word in lines[0] for word in ("7", "a.jpg", "gradient of means"))
+    assert lines == ["Step 7 is skipped: photo a.jpg gives no finite gradient of means"]
     assert guard.allows(8, "a.jpg", FINE, group(1e6))
     assert guard.skipped == 1
 
