@@ -22,7 +22,7 @@ from lang3dxl_ns.common.files import expanded, replace_file
 from lang3dxl_ns.common.memory import ran_out_of_memory
 from lang3dxl_ns.common.stages import Stages
 from lang3dxl_ns.common.stopping import stoppable
-from lang3dxl_ns.files.scene_file import SUFFIX, Provenance, replace_scene
+from lang3dxl_ns.files.scene_file import SUFFIX, Provenance, describe_scene_file, replace_scene
 from lang3dxl_ns.preparation.model_files import check_encoders
 from lang3dxl_ns.preparation.needs import needs_table, write_needs
 from lang3dxl_ns.preparation.settings import PreparationConfig
@@ -251,7 +251,7 @@ class Run:
         """Do what is left: iterations, then words. Raises as `fit`."""
         if self.is_finished and self.path.exists():
             say("The run is finished already")
-            return self.scene()
+            return self.scene().with_words(describe_scene_file(self.path)["taught"])
         first, steps = self.done, self.settings.steps
         try:
             self._train(stages)

@@ -291,8 +291,10 @@ def test_a_taught_word_outlives_a_training_over_its_scene(data, settings, short,
         return saved
 
     run.save = seen_after
-    assert run.complete(Stages({"train": 0.5, "words": 0.5})).words.keys() == {"gizmo"}
-    assert seen == [["gizmo"]] * 5
+    stages = Stages({"train": 0.5, "words": 0.5})
+    assert run.complete(stages).words.keys() == {"gizmo"} and seen == [["gizmo"]] * 5
+    again = begin(open_capture(data), settings(4), tmp_path, data / "lang3dxl_cache", "cpu")
+    assert again.complete(stages).words.keys() == {"gizmo"} and len(seen) == 5
 
 
 def without(*places: str):
