@@ -144,7 +144,7 @@ def with_all_texts(words: Sequence[str]) -> list[str]:
         elif value:
             value = False
         elif option in _REPEATED and not Path(word).exists():
-            if "/" in word or Path(word).suffix.lower() in _PLACES:
+            if ("/" in word and " " not in word) or Path(word).suffix.lower() in _PLACES:
                 raise UserError(f"{word} does not exist: correct the name, or write {option} before a text")
             given.append(option)
         given.append(word)

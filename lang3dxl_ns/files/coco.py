@@ -35,7 +35,8 @@ def check_labels_file(path: Path) -> None:
 
 def is_ours(content: Mapping[str, Any]) -> bool:
     """Return whether we wrote labels or a catalog of things. Their pixels are those of undistorted photos."""
-    return str(dict(content.get("info") or {}).get("description")).startswith(OURS["description"])
+    catalog = {"things", "relations", "heights"} <= {*content}  # earlier ones had no info
+    return catalog or str(dict(content.get("info") or {}).get("description")).startswith(OURS["description"])
 
 
 class CocoLabels:

@@ -30,7 +30,7 @@ def find_run(run: str | Path | None = None) -> Path:
     if not place.is_dir():
         what = "there is no outputs/ here" if run is None else f"{place} is not a file or folder"
         raise UserError(f"{what}: {_REMEDY}")
-    below = ["*/" * n for n in range(1, _DEEPEST + 1)]
+    below = ["[!.]*/" * n for n in range(1, _DEEPEST + 1)]
     configs = [path.parent for level in below for path in place.glob(f"{level}config.yml") if path.is_file()]
     ours = {folder for folder in configs if (folder / SCENE_FILE).is_file()}
     ours |= {path.parent for level in below for path in place.glob(level + _SCENES) if path.is_file()}
@@ -46,6 +46,8 @@ def find_run(run: str | Path | None = None) -> Path:
 def find_config(run: str | Path | None = None) -> Path:
     """Find the config.yml of a run of ns-train; `run` and errors are those of `find_run`."""
     found = find_run(run)
+    if not found.is_file() and not _config(found).is_file():
+        raise UserError(f"{found} is no run of ns-train: name the folder of one, or its config.yml")
     return found if found.is_file() else _config(found)
 
 

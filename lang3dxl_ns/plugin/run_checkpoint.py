@@ -36,8 +36,8 @@ def check_checkpoint(place: Path) -> None:
     if not checkpoints or not checkpoints[-1].exists():
         return
     remedy = (
-        "perhaps by an incomplete copy: copy it again, move it away to resume from an earlier one, or train "
-        "anew (prepared targets are kept)"
+        "copy it again if the copy was incomplete, move it away to resume from an earlier one, or train anew "
+        "(prepared targets are kept)"
     )
     with readable(f"the checkpoint {checkpoints[-1]} is damaged", remedy):
         check_whole(checkpoints[-1])

@@ -113,7 +113,7 @@ def _differences(settings: Any, complete: bool, place: str = "") -> Iterator[str
 
 def _begin(value: Any) -> str:
     """Describe a value in a few letters: a file's aliases may stand for a list of any length."""
-    return reprlib.repr(value)[:40]
+    return type(value).__name__ if is_dataclass(value) else reprlib.repr(value)[:40]
 
 
 @cache

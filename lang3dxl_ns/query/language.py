@@ -52,14 +52,15 @@ def held(typed: str, names: Iterable[str] = ()) -> tuple[str, Callable[[str], st
         return tidy(re.sub(f"{HELD}(\\d+){HELD}", lambda found: parts[int(found[1])], text))
 
     text = straight(typed).replace("\0", " ").replace(HELD, " ")
-    whole = re.compile(rf'"[^"]*"|{_words((*TABLE["one"], *names)).pattern}', re.IGNORECASE)
+    phrases = (*TABLE["one"], *filter(None, map(tidy, names)))
+    whole = re.compile(rf'"[^"]*"|{_words(phrases).pattern}', re.IGNORECASE)
     # Single spaces, since runs of them would take patterns a time that grows with their square.
     return whole.sub(hold, " ".join(text.split())), restored
 
 
 def tidy(text: str) -> str:
-    """Return a phrase without quotes and extra spaces."""
-    return " ".join(text.replace('"', " ").replace("\0", " ").split())
+    """Return a phrase without quotes and extra spaces, with accents in letters."""
+    return " ".join(normalize("NFC", text).replace('"', " ").replace("\0", " ").split())
 
 
 def straight(text: str) -> str:

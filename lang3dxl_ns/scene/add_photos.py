@@ -26,7 +26,7 @@ from scipy.spatial import KDTree
 
 from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import UserError, readable
-from lang3dxl_ns.common.files import expanded, locked, replace_file
+from lang3dxl_ns.common.files import absolute, expanded, locked, replace_file
 from lang3dxl_ns.scene.colmap import load_pycolmap, read_reconstruction
 from lang3dxl_ns.scene.colmap_files import PARTS
 from lang3dxl_ns.scene.companions import inside, work_folder
@@ -91,9 +91,9 @@ def add_photos(
         settings = replace(settings, features="sift")
     if settings.mapper != "incremental":
         raise UserError("--add places photos without a mapper: leave out --mapper")
+    folder = absolute(folder)
+    folder = extract_frames(folder) if is_video(folder) else folder
     data, folder = (Path(os.path.realpath(expanded(path))) for path in (data, folder))
-    if is_video(folder):
-        folder = extract_frames(folder)
     work = work_folder(data, cache_dir)
     place = find_model(data) or work / "sparse" / "0"
     images, old = _photos_of(data, place)
@@ -143,7 +143,7 @@ def add_photos(
 
 def _photos_of(data: Path, place: Path) -> tuple[Path, list[str]]:
     """Return the folder of a model's photos, and their names. Raises UserError if the model or its photos are
-    missing, or can't be written."""
+    missing, can't be written, or is behind a link out of the scene."""
     if not has_model(place):
         raise UserError(f"{data} has no COLMAP model to add photos to: reconstruct its own photos first")
     images = Path(os.path.realpath(images_folder(data, place)))

@@ -253,8 +253,12 @@ def find_source(
     if (source := _source_in(folder, cache_dir)) is not None:
         return folder, source
     if may_reconstruct and (photos := find_photos(folder)).names:
-        for name in photos.names:  # training would refuse them after hours
-            inside(photos.folder, name, settings.follow_links)
+        # Names of nothing and links out of the scene are told now rather than after hours.
+        images_folder(folder, folder, settings.images_path)
+        mask_folder(folder, settings.masks_path)
+        for name in photos.names:
+            if (photos.folder / name).exists():  # a link to nothing is left out like a damaged file
+                inside(photos.folder, name, settings.follow_links)
         mention_other_cameras(folder)
         return reconstruct_scene(folder, cache_dir)
     of_models = (path for part in ("images", "cameras") for path in folder.rglob(f"{part}.[bt]*"))
@@ -362,6 +366,8 @@ def _mention_what_is_not_used(capture: Capture, model: Path, listed: set[str]) -
 
 
 def _of_transforms(path: Path, settings: CaptureSettings) -> Capture:
+    if settings.images_path != CaptureSettings.images_path:
+        raise UserError(f"{path} names its photos itself: leave {capture_option('images-path')} off")
     content = read_transforms(path)
     found = Reconstruction(content.photos, content.points, content.colors)
     files = {name: name for name in content.photos}

@@ -218,7 +218,8 @@ def match(
         ids = {image.name: image.image_id for image in db.read_all_images()}
         known = sorted(n for n in photos.names if n in ids and db.num_keypoints_for_image(ids[n]))
         new.intersection_update(known)
-        matched = {pair for pair in matched if not {*pair}.difference(known)}
+        there = set(known)
+        matched = {pair for pair in matched if there.issuperset(pair)}
         learned = LearnedMatcher(database, known) if settings.features == "xfeat" else None
         if learned:
             pairs = learned.pairs()

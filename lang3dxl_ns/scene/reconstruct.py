@@ -328,7 +328,7 @@ def writable(model: Path) -> Iterator[None]:
         yield
     except (OSError, RuntimeError, ValueError, UserError) as error:
         trouble = f"the model can't be written to {model} ({error})"
-        raise UserError(f"{trouble}: make room, and run the same command again") from error
+        raise UserError(f"{trouble}: make room or allow writing, and run the same command again") from error
 
 
 def write_model(write: Callable[[Path], None], folder: Path) -> None:

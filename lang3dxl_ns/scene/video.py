@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import subprocess
 from contextlib import suppress
@@ -31,6 +32,8 @@ _MOST_CHANGE = 95
 
 _READING = ("-v", "error", "-protocol_whitelist", "file", "-format_whitelist", "mov,matroska,avi,mpegts,mpeg")
 """Options of ffmpeg for untrusted files: a playlist, for example, could name other files and addresses."""
+_RESIZED = re.compile(r"w: (\d+) h: (\d+) fmt: \S+.*?incoming frame - w: (?!\1 h: \2 )(\d+) h: (\d+) ")
+"""What ffmpeg warns of where a frame's size is not the first one's."""
 _SILENT = subprocess.DEVNULL  # ffmpeg takes what is typed, or a script's own input, for commands
 
 
@@ -59,7 +62,7 @@ def extract_frames(video: Path, rate: float = FRAMES_PER_SECOND, most: int = MOS
     unless an earlier call did. Raises UserError without ffmpeg, for a file that is no video or a very short
     one, and for a folder with the frames of another video."""
     folder = frames_folder(video)
-    made_of = cache_folder(folder, None) / "video.json"
+    made_of = folder / "lang3dxl_cache" / "video.json"
     this = known = [video.name, video.stat().st_size] if video.is_file() else None
     if (folder / "images").is_dir():
         with suppress(*DAMAGE):  # frames of an earlier version have no such file
@@ -76,6 +79,9 @@ def extract_frames(video: Path, rate: float = FRAMES_PER_SECOND, most: int = MOS
     stretches = max(1, min(most, int(duration * rate + 0.01)))  # times are rounded
     say(f"{video.name}: {duration:.0f} s, the sharpest frame of each of {stretches} intervals")
     with locked(folder, busy=f"another command writes frames into {folder}: wait for it, or end it"):
+        if (folder / "images").is_dir():  # another command has just written them
+            return extract_frames(video, rate, most)
+        cache_folder(folder, None)  # a link is not written through
         sharpness, change = _looks(video)
         if len(sharpness) < 3:
             few = f"{len(sharpness)} frames, too few"
@@ -100,8 +106,10 @@ def _looks(video: Path) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
     """Compute, for every frame, downsized and gray, the variance of its Laplacian and its difference from the
     frame before, which is coarse so that noise is none."""
     width, height = _LOOK
-    command = [*_reading("ffmpeg", video), *_each(f"scale={width}:{height}")]
-    command += ["-f", "rawvideo", "-pix_fmt", "gray", "-"]
+    program, *source = _reading("ffmpeg", video)
+    # Where the picture changes its size, filters would begin anew, and frames after it would be others.
+    command = [program, "-reinit_filter", "0", *source, *_each(f"scale={width}:{height}")]
+    command += ["-v", "info", "-nostats", "-f", "rawvideo", "-pix_fmt", "gray", "-"]
     values, changes, before = [], [], None
     with (
         TemporaryFile() as errors,
@@ -114,10 +122,14 @@ def _looks(video: Path) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
             coarse = gray.reshape(height // _COARSE, _COARSE, width // _COARSE, _COARSE).mean((1, 3))
             changes.append(0.0 if before is None else float(np.abs(coarse - before).mean()))
             before = coarse
-        if process.wait():
-            errors.seek(0)
-            said = " ".join(errors.read().decode(errors="replace").split())[-200:]
-            raise UserError(f"ffmpeg can't read {video} ({said}): copy it again, or convert it")
+        failed = process.wait()
+        errors.seek(0)
+        said = " ".join(errors.read().decode(errors="replace").split())
+    if failed:
+        raise UserError(f"ffmpeg can't read {video} ({said[-200:]}): copy it again, or convert it")
+    if sizes := _RESIZED.search(said):
+        was, now = (f"{sizes[i]} x {sizes[i + 1]}" for i in (1, 3))
+        raise UserError(f"{video} changes its size from {was} to {now} pixels: cut it there into two videos")
     return np.array(values), np.array(changes)
 
 

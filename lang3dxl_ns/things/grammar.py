@@ -35,6 +35,8 @@ INSIDE = 0.7
 """Half-size of a box, relative to its own edges, within which a center is in or on it."""
 CLOSE = 1.3
 """Ratio of two sizes below which either may be the larger one."""
+UPSIDE_DOWN = -0.5
+"""Cosine between up and a picture's upper side below which it stands on its head."""
 
 
 @cache
@@ -100,7 +102,8 @@ def sight_of(scene: Answering, things: list[Thing], photo: str | None = None) ->
     """Return the directions of a photo's viewer, and which of the things it shows; by default of the photo
     that shows most of them, as if it showed all."""
     taken = best_photo(scene, things) if photo is None else scene.file.photo(photo)
-    up, (x, _, back, _) = up_of(scene), np.array(taken.camera_to_world).T
+    up, (x, top, back, _) = up_of(scene), np.array(taken.camera_to_world).T
+    x = -x if top @ up < UPSIDE_DOWN else x
     # The picture's right, which no look straight down mirrors; for a picture on its side, the viewer's.
     right = max((x - up * (x @ up), np.cross(up, back)), key=np.linalg.norm)
     right = right / max(np.linalg.norm(right), 1e-9)

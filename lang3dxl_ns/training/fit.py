@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import threading
 import warnings
+from contextlib import suppress
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from difflib import get_close_matches
 from pathlib import Path
@@ -250,8 +251,10 @@ class Run:
     def complete(self, stages: Stages) -> Scene:
         """Do what is left: iterations, then words. Raises as `fit`."""
         if self.is_finished and self.path.exists():
-            say("The run is finished already")
-            return self.scene().with_words(describe_scene_file(self.path)["taught"])
+            with suppress(UserError):  # a damaged file is set aside below, and written anew
+                words = describe_scene_file(self.path)["taught"]
+                say("The run is finished already")
+                return self.scene().with_words(words)
         first, steps = self.done, self.settings.steps
         try:
             self._train(stages)
@@ -436,5 +439,5 @@ def train(
     try:
         return run_folder(data, out, chosen, restart)[1]
     except KeyboardInterrupt as error:
-        resuming = f"the same call{' without restart' if restart else ''}"
-        raise UserError(f"training was stopped; to resume: {resuming}") from error
+        begun = ", without restart if iterations had begun" if restart else ""
+        raise UserError(f"training was stopped; to resume: the same call{begun}") from error

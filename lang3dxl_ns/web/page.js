@@ -99,7 +99,7 @@ async function ask(typed, turn = cleared) {
     draw(settled ? card : null);
     if (found.meant && found.trust.level !== "sure") offerMeant(found.meant, card);
   }
-  if (about.words && !found && turn === cleared && tidy(String(typed))) say("Put what to find first: windows not doors.");
+  if (about.words && !found && turn === cleared && tidy(String(typed))) say("The prompt is empty: type what to look for, such as rose window.");
   const { known = false, doubtful = true, threshold = null, peak = 0, matching = 0 } = found ?? {};
   return { known, doubtful, threshold, peak, matching };
 }
@@ -385,7 +385,7 @@ function keepWord({ text, examples, named }, before = text) {
 
 /** Return a word that was named in this browser as a prompt; null if there is none. */
 function namedWord(text) {
-  const found = kept.words.find(({ name }) => name?.toLowerCase() === text.toLowerCase());
+  const found = kept.words.find(({ name }) => name && tidy(name).toLowerCase() === text.toLowerCase());
   return found && areExamples(found.examples, about.count) ? { text: found.name, examples: found.examples, named: true } : null;
 }
 

@@ -61,7 +61,7 @@ class PageWords:
         tour, before = map(str, told)
         with self._one, nullcontext() if self.file is None else locked(self.file.resolve().parent):
             kept = known if self.file is None else describe_scene_file(self.file)["provenance"].tour
-            if kept not in ("", before):
+            if kept not in ("", before, tour):
                 return kept, False
             if self.file is not None:
                 keep_words(self.file, {}, tour)

@@ -35,8 +35,8 @@ RATE, SIZE = 25, (1280, 720)
 _FLIGHT, _PAUSE, _LETTER = 2.0, 3.0, 0.06
 """Seconds of a flight, at a stop, and for each letter of its caption."""
 _MOST_STOPS, _MOST_CAPTION, _WIDEST, _STANDS = 1000, 300, 110.0, 1e-4
-"""Most stops and letters of a caption, degrees of a lens that shows as much to both sides as another window,
-and share of its distance within which an eye only turns, as in the page (tour.js, move.js)."""
+"""Most stops; and as in the page (tour.js, move.js): most letters of a caption, degrees of a lens that shows
+as much to both sides as another window, and share of its distance within which an eye only turns."""
 _LEFT_OUT = {
     **{"like": "words marked by example", "look": "lightings", "photo": "photos", "cameras": "cameras"},
     **{"hide": "hidden floaters", "hue": "chosen colors", "thing": "chosen things"},

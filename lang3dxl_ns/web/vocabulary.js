@@ -5,7 +5,7 @@ import { request } from "./think.js";
 
 const MOST_TEXT = 2000; // most characters of a phrase
 
-export const tidy = (text) => text.replace(/["\0]/g, " ").split(/\s+/).filter(Boolean).join(" ");
+export const tidy = (text) => text.normalize("NFC").replace(/["\0]/g, " ").split(/\s+/).filter(Boolean).join(" ");
 
 // ── what people type, as in Python's query/language.py; both read query/language.json ──
 
@@ -87,7 +87,7 @@ export class Vocabulary {
   constructor(described, buffer, width, live) {
     Object.assign(this, { ...described, width, live });
     this.numbers = floats(new Uint16Array(buffer));
-    this.index = new Map(this.words.map((word, i) => [word.toLowerCase(), i]).reverse());
+    this.index = new Map(this.words.map((word, i) => [tidy(word).toLowerCase(), i]).reverse());
     this.shared = this.negatives.map((_, i) => this.row(i));
     this.all = this.negatives.map((_, i) => i);
     this.encoded = new Map();

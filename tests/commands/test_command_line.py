@@ -94,7 +94,8 @@ def test_several_texts_may_follow_their_flag_and_the_scene_too(flag, tmp_path):
 
 @pytest.mark.parametrize("word", ["castl.scene", "castl.GLB", "../runs/castle"])
 def test_a_mistyped_scene_is_no_text_of_the_newest_run(word):
-    assert cli.with_all_texts(["query", "--text", word, "St. Mary"])[-2:] == ["--text", "St. Mary"]
+    for text in ("St. Mary", "doors and/or gates"):
+        assert cli.with_all_texts(["query", "--text", word, text])[-2:] == ["--text", text]
     with pytest.raises(SystemExit, match=f"{word} does not exist: correct the name"):
         cli.main(["query", "--text", "windows", word])
 

@@ -83,6 +83,8 @@ def test_a_run_is_found_by_its_scene_file_too_and_a_word_taught_later_makes_it_n
         path.touch()
     assert find_run().resolve() == runs[1].parent  # neither is a scene yet
     scene.touch()
+    (deleted := tmp_path / "outputs" / ".trash" / "d.scene").parent.mkdir()
+    deleted.touch()
     for began, newest in ((5000, folder), (500, runs[1].parent)):
         os.utime(record, (began, began))
         os.utime(scene, (9000, 9000))
@@ -90,6 +92,9 @@ def test_a_run_is_found_by_its_scene_file_too_and_a_word_taught_later_makes_it_n
             assert find_run(place).resolve() == newest
             found = find_scene_file(place)
             assert found is None if newest == runs[1].parent else scene.samefile(found)
+    os.utime(record, (5000, 5000))
+    with pytest.raises(UserError, match="is no run of ns-train"):
+        find_config()
     assert find_run("outputs/c") == folder.relative_to(tmp_path) and find_run(scene) == scene
 
 

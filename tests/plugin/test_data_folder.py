@@ -215,6 +215,19 @@ def test_each_frame_of_a_video_is_looked_at_and_written_once(tmp_path, name, rat
 
 
 @needs_ffmpeg
+def test_a_video_that_changes_its_size_is_told(tmp_path):
+    film = tmp_path / "turned.mts"
+    for size in ("64x48", "48x64"):
+        graph = ["-f", "lavfi", "-i", f"testsrc=size={size}:rate=25,trim=end_frame=30", "-f", "mpegts", "-"]
+        part = subprocess.run(["ffmpeg", "-v", "error", *graph], check=True, capture_output=True).stdout
+        film.write_bytes((film.read_bytes() if film.exists() else b"") + part)
+    with pytest.raises(
+        UserError, match=r"turned.mts changes its size from 64 x 48 to 48 x 64 pixels: cut it"
+    ):
+        _looks(film)
+
+
+@needs_ffmpeg
 def test_what_ffmpeg_says_of_a_video_that_it_cannot_read_is_told(tmp_path):
     with pytest.raises(UserError, match=r"ffmpeg can't read .*a\.mp4 \(.*No such file.*copy it again"):
         _looks(tmp_path / "a.mp4")

@@ -2,6 +2,7 @@
 
 import base64
 import json
+import shutil
 import struct
 import zlib
 from pathlib import Path
@@ -225,8 +226,16 @@ def test_a_misspelled_part_of_a_scene_is_told_by_name(folder, setting, name):
         open_capture(folder, CaptureSettings(**{setting: Path(name)}))
 
 
+@pytest.mark.parametrize("setting", ["images_path", "masks_path"])
+def test_it_is_told_before_a_reconstruction(folder, setting, monkeypatch):
+    monkeypatch.setattr(capture, "reconstruct_scene", lambda *_: pytest.fail("it begins"))
+    shutil.rmtree(folder / "sparse")
+    with pytest.raises(UserError, match="undistortd"):
+        open_capture(folder, CaptureSettings(**{setting: Path("undistortd")}))
+
+
 def test_photos_that_are_links_are_refused_before_they_are_reconstructed(folder, tmp_path, monkeypatch):
-    """Training would refuse all of them after hours."""
+    """Training would leave out all of them after hours. One to nothing is left out like a damaged photo."""
     made = []
     monkeypatch.setattr(capture, "reconstruct_scene", lambda *given: made.append(given) or given)
     (tmp_path / "links").mkdir()
@@ -237,6 +246,10 @@ def test_photos_that_are_links_are_refused_before_they_are_reconstructed(folder,
     assert made == []
     capture.find_source(tmp_path / "links", CaptureSettings(follow_links=True))
     assert len(made) == 1
+    shutil.rmtree(folder / "sparse")
+    (folder / "images" / "gone.png").symlink_to(tmp_path / "gone.png")
+    capture.find_source(folder, CaptureSettings())
+    assert len(made) == 2
 
 
 def test_a_link_to_nothing_is_no_photo_of_another_scenes_cache(folder, tmp_path):

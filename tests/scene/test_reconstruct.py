@@ -256,7 +256,7 @@ def test_a_model_that_a_full_disk_cuts_off_is_none_and_the_command_can_be_repeat
 
     with monkeypatch.context() as full:
         full.setattr(pycolmap.Reconstruction, "write_binary", cut_off)
-        with pytest.raises(UserError, match="make room, and run the same command again"):
+        with pytest.raises(UserError, match="make room or allow writing, and run the same command again"):
             reconstruct_scene(photos, None, SIFT)
     assert not (photos / "sparse").exists()
     assert len(read_reconstruction(reconstruct_scene(photos, None, SIFT)[1]).photos) == 7

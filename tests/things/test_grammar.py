@@ -191,8 +191,10 @@ def test_a_photo_from_above_has_the_right_of_its_picture(tilt):
     )
 
 
-def test_a_picture_on_its_side_has_the_right_of_whoever_took_it():
-    sight = sight_in((0, 1, 0), (-1, 0, 0), (0, 0, 1))
+@pytest.mark.parametrize("roll", [90, 150, 180, 270])
+def test_a_picture_on_its_side_or_head_has_the_right_of_whoever_took_it(roll):
+    sin, cos = np.sin(np.radians(roll)), np.cos(np.radians(roll))
+    sight = sight_in((cos, sin, 0), (-sin, cos, 0), (0, 0, 1))
     np.testing.assert_allclose([sight.right, sight.ahead], [(1, 0, 0), (0, 0, -1)], atol=1e-6)
 
 

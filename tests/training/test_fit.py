@@ -295,6 +295,8 @@ def test_a_taught_word_outlives_a_training_over_its_scene(data, settings, short,
     assert run.complete(stages).words.keys() == {"gizmo"} and seen == [["gizmo"]] * 5
     again = begin(open_capture(data), settings(4), tmp_path, data / "lang3dxl_cache", "cpu")
     assert again.complete(stages).words.keys() == {"gizmo"} and len(seen) == 5
+    path.write_bytes(path.read_bytes()[:1000])
+    assert len(again.complete(stages).splats) == len(read_scene(path).splats)
 
 
 def without(*places: str):

@@ -168,6 +168,11 @@ def test_what_is_no_tour_is_not_kept(content):
         PageWords().keep_tour(json.loads(content), "")
 
 
+def test_a_tour_that_is_kept_already_is_no_other_one():
+    assert PageWords().keep_tour({"tour": "#a", "before": ""}, "#a") == ("#a", True)
+    assert PageWords().keep_tour({"tour": "#b", "before": ""}, "#a") == ("#a", False)
+
+
 def test_a_new_tab_opens_with_the_tour_kept_last_which_only_it_replaces(file):
     def keep(tour, before):
         return posted(server, json.dumps({"tour": tour, "before": before}), "/api/tour")[0]
