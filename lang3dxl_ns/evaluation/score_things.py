@@ -58,7 +58,7 @@ def score_things(scene: Scene, path: Path) -> list[tuple[str, int, int, int, flo
         sizes = {image["file_name"]: (image["width"], image["height"]) for image in drawn}
     bent = {one.name: one for one in scene.photos if one.lens.distorts or one.quarter_turns}
     for (name, word), boxes in true.items():
-        if name in bent.keys() & sizes:
+        if name in bent and name in sizes:
             true[name, word] = _undistorted(bent[name], sizes[name], boxes)
     given, scores = _boxes(coco(scene, scene.things([Prompt(word) for word in words]))), []
     for word in words:

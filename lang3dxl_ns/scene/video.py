@@ -32,7 +32,7 @@ _MOST_CHANGE = 95
 
 _READING = ("-v", "error", "-protocol_whitelist", "file", "-format_whitelist", "mov,matroska,avi,mpegts,mpeg")
 """Options of ffmpeg for untrusted files: a playlist, for example, could name other files and addresses."""
-_RESIZED = re.compile(r"w: (\d+) h: (\d+) fmt: \S+.*?incoming frame - w: (?!\1 h: \2 )(\d+) h: (\d+) ")
+_RESIZED = re.compile(r"w: (\d+) h: (\d+) fmt:[^,]*, incoming frame - w: (?!\1 h: \2 )(\d+) h: (\d+) ")
 """What ffmpeg warns of where a frame's size is not the first one's."""
 _SILENT = subprocess.DEVNULL  # ffmpeg takes what is typed, or a script's own input, for commands
 

@@ -21,7 +21,7 @@ from lang3dxl_ns.plugin.datamanager import Lang3DXLDataManagerConfig
 from lang3dxl_ns.plugin.dataparser import PhotoCollectionDataParserConfig, parser_for
 from lang3dxl_ns.scene.capture import Capture
 from lang3dxl_ns.scene.layout import images_folder
-from lang3dxl_ns.scene.video import _looks, _sharpest, _write, extract_frames
+from lang3dxl_ns.scene.video import _RESIZED, _looks, _sharpest, _write, extract_frames
 
 needs_ffmpeg = pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="ffmpeg is not installed")
 
@@ -221,10 +221,10 @@ def test_a_video_that_changes_its_size_is_told(tmp_path):
         graph = ["-f", "lavfi", "-i", f"testsrc=size={size}:rate=25,trim=end_frame=30", "-f", "mpegts", "-"]
         part = subprocess.run(["ffmpeg", "-v", "error", *graph], check=True, capture_output=True).stdout
         film.write_bytes((film.read_bytes() if film.exists() else b"") + part)
-    with pytest.raises(
-        UserError, match=r"turned.mts changes its size from 64 x 48 to 48 x 64 pixels: cut it"
-    ):
+    with pytest.raises(UserError, match=r"turned.mts changes its size from 64 x 48 to 48 x 64 pixels"):
         _looks(film)
+    other_color = "filter context - w: 64 h: 48 fmt: 0 csp: a, incoming frame - w: 64 h: 48 fmt: 4 csp: b "
+    assert _RESIZED.search(other_color * 20_000) is None  # at once
 
 
 @needs_ffmpeg
