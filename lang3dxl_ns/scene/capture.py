@@ -27,10 +27,11 @@ from lang3dxl_ns.scene.camera import camera_to_world, view_matrix
 from lang3dxl_ns.scene.capture_settings import CAPTURE_BOUNDS, CaptureSettings
 from lang3dxl_ns.scene.colmap import Reconstruction, TrackedPhoto, photos_in_model, read_reconstruction
 from lang3dxl_ns.scene.companions import cache_folder, inside, is_inside
-from lang3dxl_ns.scene.frame import COLMAP_UP, Frame, find_frame, lost_cameras, no_scene
+from lang3dxl_ns.scene.frame import COLMAP_UP, Frame, find_frame, lost_cameras, no_scene, wrong_cameras
 from lang3dxl_ns.scene.layout import (
     MODEL_FOLDERS,
     find_model,
+    find_transforms,
     has_model,
     images_folder,
     mention_other_cameras,
@@ -44,7 +45,7 @@ from lang3dxl_ns.scene.photo_folder import check_data, find_photos, photos_below
 from lang3dxl_ns.scene.reconstruct import reconstruct_scene
 from lang3dxl_ns.scene.reconstruction import CONTRADICTED, doubtful_photos, reasons_in_words
 from lang3dxl_ns.scene.record import SceneRecord
-from lang3dxl_ns.scene.transforms import SPLITS, TRANSFORMS, Transforms, read_transforms
+from lang3dxl_ns.scene.transforms import Transforms, read_transforms
 from lang3dxl_ns.scene.video import extract_frames, frames_folder, is_video
 
 _OWN_MODEL = Path("lang3dxl_cache/reconstruction/sparse/0")
@@ -98,6 +99,11 @@ class Capture:
         if self.known_split is not None:
             return self.known_split
         train, held_out = self._listed_split() or self._split_by_rule()
+        if train and not held_out and self.settings.held_out is None:
+            say(
+                f"the lists of {self.folder} hold out no photo that is there: those of training are evaluated"
+            )
+            held_out = train
         for part, names in (("train", train), ("held-out", held_out)):
             if not names:
                 raise UserError(
@@ -220,15 +226,17 @@ def open_capture(
         capture = replace(capture, doubtful={n: doubts[n] for n in capture.names if n in doubts})
     if not capture.photos:
         first = next(iter(capture.left_out.items()), ("", "it lists none"))
+        images = f"put them into images/ there, or name their folder ({capture_option('images-path')})"
+        remedy = f"correct {source}" if capture.transforms is not None else images
         raise UserError(
-            f"none of the {len(capture.left_out)} photos of {folder} can be used; the first: "
-            f"{': '.join(first)}. Put them into images/ there, or name their folder "
-            f"({capture_option('images-path')})"
+            f"none of the {len(capture.left_out)} photos of {folder} can be used: {remedy}. The first: "
+            f"{': '.join(first)}"
         )
     capture = _without_lost_cameras(capture)
-    centers = np.array([tracked.center for tracked in capture.reconstruction.photos.values()])
-    if why := no_scene(centers, capture.reconstruction.points):
-        say(f"{source}: {why}. No scene comes of it: give the poses that the photos were taken from")
+    tracked, points = list(capture.reconstruction.photos.values()), capture.reconstruction.points
+    centers = np.array([photo.center for photo in tracked])
+    if why := no_scene(centers, points) or wrong_cameras(tracked, points):
+        say(f"{source}: {why}. No scene comes of it: give the cameras that the photos were taken with")
     return capture
 
 
@@ -249,9 +257,9 @@ def find_source(
         return folder, folder / settings.colmap_path
     if (whole := whole_scene(folder)) != folder:
         say(f"{folder} is a part of the scene {whole}, which is read")
-        return whole, folder if has_model(folder) else find_model(whole) or folder
+        return whole, folder if has_model(folder) else _source_in(whole, cache_dir) or folder
     if (source := _source_in(folder, cache_dir)) is not None:
-        return folder, source
+        return source.parent if source.suffix == ".json" else folder, source
     if may_reconstruct and (photos := find_photos(folder)).names:
         # Names of nothing and links out of the scene are told now rather than after hours.
         images_folder(folder, folder, settings.images_path)
@@ -281,9 +289,7 @@ def _source_in(folder: Path, cache_dir: Path | None) -> Path | None:
     if cache_dir is not None:
         work = expanded(cache_dir).absolute() / "reconstruction"
         reconstructed += [work / "sparse/0"] if shows_these(work, folder) else []
-    transforms = [folder / name for name in (TRANSFORMS, SPLITS[0])]
-    found = [*filter(has_model, reconstructed), *filter(Path.exists, transforms)]
-    return find_model(folder) or next(iter(found), None)
+    return find_model(folder) or next(filter(has_model, reconstructed), None) or find_transforms(folder)
 
 
 # ── from a COLMAP model ─────────────────────────────────────────────────────────────────────────────────

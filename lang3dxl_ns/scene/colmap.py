@@ -88,6 +88,7 @@ def read_reconstruction(model_dir: Path) -> Reconstruction:
     if files.colorless:
         say(f"{files.colorless} points of {model_dir} have no color and are gray")
     rows = dict(zip(files.numbers[sound].tolist(), range(int(sound.sum())), strict=True))
+    rows.pop(-1, None)  # the number of no point, which keypoints without one have
     positions = files.positions[sound]
     tracked = {photo.name: _tracked_photo(photo, files, rows, positions) for photo in photos}
     return Reconstruction(dict(sorted(tracked.items())), positions, files.colors[sound])

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Bool, Float, Float64
 from numpy import ndarray as Array
 
 from lang3dxl_ns.scene.capture_settings import Center, Orientation
+
+if TYPE_CHECKING:
+    from lang3dxl_ns.scene.colmap import TrackedPhoto
 
 COLMAP_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 """Rotation from COLMAP's usual y down to z up."""
@@ -18,6 +23,10 @@ _MOST_LOST = 1 / 4
 """Largest share of cameras that can be lost. Where more stand apart, they are another part of the scene."""
 _LEAST_ANGLE = 1e-3
 """Extent of all points, relative to their distance, below which they are a pixel of every photo."""
+_OFF_CENTER = 0.2
+"""Distance of a lens's center from the picture's, relative to its side, that hardly any camera has."""
+_MOST_PROJECTED = 10_000
+"""Number of points that tell whether a photo sees any."""
 _PARALLEL = 0.17
 """Deviation of the cameras' right axes from a plane's normal (10 degrees) below which they are parallel."""
 
@@ -104,6 +113,45 @@ def no_scene(centers: Float[Array, "n 3"], points: Float[Array, "m 3"]) -> str |
         if wide < _LEAST_ANGLE * far:
             return f"the points lie {wide:.2g} units apart, {far:.2g} from the cameras, as in other units"
     return None
+
+
+def wrong_cameras(photos: Collection[TrackedPhoto], points: Float[Array, "m 3"]) -> str | None:
+    """Tell why most cameras can't be those of their photos; None if they can. Exporters confuse the
+    directions of poses and of axes, and sizes of pictures."""
+    away = [photo for photo in photos if abs(_center(photo) - 0.5).max() > _OFF_CENTER]
+    if 2 * len(away) > len(photos):
+        lens = away[0].lens
+        return (
+            f"the lenses of {len(away)} of {len(photos)} photos have their center far from the picture's, "
+            f"as {away[0].name} at {lens.cx:.4g}, {lens.cy:.4g} of {lens.width} × {lens.height} pixels: "
+            "focal lengths and centers may be those of pictures of another size"
+        )
+    points = points[:: 1 + len(points) // _MOST_PROJECTED]
+    blind = [photo for photo in photos if len(points) > 1 and not _sees(photo, points)]
+    if 2 * len(blind) > len(photos):
+        return (
+            f"{len(blind)} of {len(photos)} photos do not see the points, such as {blind[0].name}: poses may "
+            "have the wrong direction (camera → world or world → camera) or axes, or points other "
+            "coordinates than poses"
+        )
+    return None
+
+
+def _center(photo: TrackedPhoto) -> Float64[Array, "2"]:
+    lens = photo.lens
+    return np.array([lens.cx / lens.width, lens.cy / lens.height])
+
+
+def _sees(photo: TrackedPhoto, points: Float[Array, "m 3"]) -> bool:
+    """Return whether half of a photo's tracked points, or without any one of these, lies in its view."""
+    tracked, lens, view = len(photo.points) > 0, photo.lens, photo.camera_from_world
+    x, y, z = view[:, :3] @ (photo.points if tracked else points).T + view[:, 3:]
+    z = np.where(z > 0, z, np.nan)
+    with np.errstate(over="ignore"):
+        across, down = lens.fx * x / z + lens.cx, lens.fy * y / z + lens.cy
+    near = (abs(across / lens.width - 0.5) < 1) & (abs(down / lens.height - 0.5) < 1)  # lenses may distort
+    seen = z > 0 if lens.fisheye else near
+    return bool(seen.mean() >= 0.5 if tracked else seen.any())
 
 
 def _apart(centers: Float[Array, "n 3"], points: Float[Array, "m 3"]) -> bool:

@@ -13,7 +13,8 @@ from lang3dxl_ns.common.files import read_text
 from lang3dxl_ns.common.options import capture_option
 from lang3dxl_ns.scene.colmap import photos_in_model
 from lang3dxl_ns.scene.companions import named_folder
-from lang3dxl_ns.scene.photo_folder import find_photos, photos_below
+from lang3dxl_ns.scene.photo_folder import find_photos, photos_below, smaller_copies
+from lang3dxl_ns.scene.transforms import SPLITS, TRANSFORMS
 
 MODEL_FOLDERS = (
     *(Path("sparse/0"), Path("sparse"), Path("colmap/sparse/0"), Path("colmap/sparse"), Path("dense/sparse")),
@@ -21,8 +22,6 @@ MODEL_FOLDERS = (
 )
 """Usual places of a model, the first of which counts. Elsewhere, the model with the most photos does."""
 _IMAGES = Path("images")
-_SMALLER = tuple(Path(f"images_{factor}") for factor in (2, 4, 8))
-"""Copies of the photos at lower resolutions, which are used if there are no others."""
 _DEPTH = 3
 """Levels of folders below a scene's that are searched for a model."""
 _RESULTS = ("lang3dxl_cache", "outputs", "nerfstudio_models")
@@ -46,10 +45,30 @@ def whole_scene(folder: Path) -> Path:
         above = (parent for parent in folder.parents[:_DEPTH] if any(photos_below(parent / "images")))
         return next(above, folder)
     usual = {
-        path: any(has_model(path / place) for place in MODEL_FOLDERS) for path in (folder, folder.parent)
+        path: any(has_model(path / place) for place in MODEL_FOLDERS) or _transforms_in(path) is not None
+        for path in (folder, folder.parent)
     }
     photos_alone = folder.name == "images" and not usual[folder]
     return folder.parent if photos_alone and usual[folder.parent] else folder
+
+
+def _transforms_in(folder: Path) -> Path | None:
+    return next((folder / name for name in (TRANSFORMS, SPLITS[0]) if (folder / name).exists()), None)
+
+
+def find_transforms(folder: Path) -> Path | None:
+    """Find the transforms.json of a scene's folder: in it, or else the only one below it, if all photos lie
+    beside that, which is said; None without one."""
+    if (found := _transforms_in(folder)) is not None:
+        return found
+    below = [found for here in _searched(folder) if (found := _transforms_in(here)) is not None]
+    if len(below) != 1:
+        return None
+    beside = f"{below[0].parent.relative_to(folder).as_posix()}/"
+    if not all(name.startswith(beside) for name in photos_below(folder)):
+        return None
+    say(f"the cameras of {folder} are in {below[0]}, which is used")
+    return below[0]
 
 
 def find_model(folder: Path) -> Path | None:
@@ -68,27 +87,34 @@ def find_model(folder: Path) -> Path | None:
 
 
 def _models_below(folder: Path) -> Iterator[Path]:
-    for parent, folders, _ in os.walk(folder):
-        here = Path(parent)
-        deep = len(here.relative_to(folder).parts) >= _DEPTH
-        folders[:] = [] if deep else sorted(f for f in folders if f not in _RESULTS and f[0] not in "._")
+    for here in _searched(folder):
         if has_model(here) and any((here / f"cameras{ending}").is_file() for ending in (".bin", ".txt")):
             yield here
 
 
+def _searched(folder: Path) -> Iterator[Path]:
+    """Yield a folder and those below it that may hold cameras."""
+    for parent, folders, _ in os.walk(folder):
+        here = Path(parent)
+        deep = len(here.relative_to(folder).parts) >= _DEPTH
+        folders[:] = [] if deep else sorted(f for f in folders if f not in _RESULTS and f[0] not in "._")
+        yield here
+
+
 def images_folder(data: Path, model: Path, named: Path = _IMAGES) -> Path:
-    """Return the folder of a model's photos: `named` in the scene's or, where that is the usual one and has
-    no photos, images/ nearest above the model, else wherever there are photos. Raises UserError if the named
-    one does not exist."""
+    """Return the folder of a model's photos: `named` in the scene's or, where that is the usual one, images/
+    nearest above the model (those of an undistorted model lie beside it, the originals farther up), else
+    wherever there are photos. Raises UserError if the named one does not exist."""
     if named != _IMAGES:
         return named_folder(named, data, "images-path", capture_option)
-    above = [parent / named for parent in model.parents if parent.is_relative_to(data)]
-    for folder in (data / named, *above):
-        if any(photos_below(folder)):
-            return folder
+    above = [*(parent for parent in model.parents if parent != data and parent.is_relative_to(data)), data]
+    for parent in above:
+        if any(photos_below(parent / named)):
+            return parent / named
     if (found := find_photos(data)).names:
         return found.folder
-    return next((data / path for path in _SMALLER if any(photos_below(data / path))), data / named)
+    smaller = (parent / Path(copies[0]).parts[0] for parent in above if (copies := smaller_copies(parent)))
+    return next(smaller, data / named)
 
 
 def mention_other_cameras(folder: Path) -> None:

@@ -61,6 +61,10 @@ def _deepest(folders: _Parts, files: Sequence[str]) -> list[str]:
     return [file for file in files if depths[file] == best]
 
 
+def _same_folders(name: str, file: str) -> bool:
+    return normal_parts(name)[:-1] == normal_parts(file)[:-1]
+
+
 def resolve(
     names: Sequence[str], exists: Callable[[str], bool], list_files: Callable[[], Iterable[str]], what: str
 ) -> tuple[dict[str, str], dict[str, UserError]]:
@@ -92,10 +96,13 @@ def resolve(
             guessed[name] = fitting[0]
         elif fitting:
             refused[name] = UserError(f"it is not there, and fits {len(fitting)} files: {some(fitting, 3)}")
+    # Of several names, the one whose folders are the file's own keeps it: a/x for a/x.jpg, not b/x.
+    owners = Counter(file for name, file in guessed.items() if _same_folders(name, file))
     shared = {file for file, count in Counter(guessed.values()).items() if count > 1}
     for name in [name for name, file in guessed.items() if file in shared]:
-        file = guessed.pop(name)
-        refused[name] = UserError(f"it is not there, and {file} fits other names as well")
+        if owners[file := guessed[name]] != 1 or not _same_folders(name, file):
+            del guessed[name]
+            refused[name] = UserError(f"it is not there, and {file} fits other names as well")
     if guessed:
         name, file = next(iter(guessed.items()))
         say(f"{len(guessed)} of {len(names)} {what} have other names than listed: {some([name])} is {file}")

@@ -27,9 +27,13 @@ from lang3dxl_ns.scene.reconstruction import PICTURE, REPORT
 from lang3dxl_ns.scene.video import frames_folder, is_video
 
 IMAGE_FOLDERS = (Path("images"), Path("dense/images"))
+_SMALLER = ("images_2", "images_4", "images_8")
+"""Folders of copies of the photos at lower resolutions."""
 _NOT_PHOTOS = {
+    *_SMALLER,
     *("masks", "mask", "segments", "depth", "depths", "normals", "ground_truth", "labels", "sparse", "dense"),
-    *("lang3dxl_cache", "outputs", "renders", "colmap", "images_2", "images_4", "images_8"),
+    *("lang3dxl_cache", "outputs", "renders", "colmap", "confidence"),
+    *("@eadir", "#recycle", "$recycle.bin"),
 }
 _KNOWN = (*PHOTO_SUFFIXES, *RAW_SUFFIXES, *OTHER_SUFFIXES)
 _OWN = re.compile(r"\.[0-9a-f]{16}\.(png|jpg)$")
@@ -159,6 +163,13 @@ def photos_below(folder: Path) -> list[str]:
             if lower.isdisjoint(photos_of_mask(file.casefold())):
                 names.append(Path(parent, file).relative_to(folder).as_posix())
     return sorted(names)
+
+
+def smaller_copies(folder: Path) -> list[str]:
+    """List the copies of the photos of a folder at the highest of lower resolutions, relative to it. They
+    stand for photos that aren't there."""
+    found = ([f"{part}/{name}" for name in photos_below(folder / part)] for part in _SMALLER)
+    return next(filter(None, found), [])
 
 
 def files_below(folder: Path) -> Iterator[str]:

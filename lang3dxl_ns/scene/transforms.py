@@ -23,7 +23,7 @@ from lang3dxl_ns.scene.colmap import FISHEYE_MODELS, PERSPECTIVE_MODELS, Tracked
 from lang3dxl_ns.scene.companions import inside
 from lang3dxl_ns.scene.names import listed, resolve
 from lang3dxl_ns.scene.photo import stored_size
-from lang3dxl_ns.scene.photo_folder import files_below, photos_below
+from lang3dxl_ns.scene.photo_folder import files_below, photos_below, smaller_copies
 from lang3dxl_ns.scene.ply_points import read_ply_points
 
 TRANSFORMS = "transforms.json"
@@ -36,6 +36,8 @@ _PERSPECTIVE = {
 }
 """Coefficients of the camera models, in OpenCV's order. Programs write those of another model, too."""
 _FISHEYE = ("k1", "k2", "k3", "k4")
+_OTHER_LENSES = ("equirectangular", "latlong", "orthographic", "ftheta_p0")
+"""Keys by which instant-ngp's files tell a lens of another kind."""
 _LISTS = ("train_filenames", "val_filenames", "test_filenames")
 _NOTHING = np.zeros((0, 3))
 
@@ -65,16 +67,17 @@ def read_transforms(path: Path) -> Transforms:
     """Read a transforms.json with its points. Photos, masks and points lie in its folder. The files of a
     split are read together. Raises UserError if the file is damaged, lists no photo, or names points outside
     its folder."""
+    content = _content(path)
     with readable(f"{path} can't be used", "correct it, or make it again"):
-        content = _content(path)
         frames = content["frames"]
+        expect(bool(frames), "it lists no photo under frames")
         applied, scale = content.get("applied_transform"), content.get("applied_scale", 1.0)
         if applied is not None:
             check_pose(applied)
         expect(is_coordinate(scale) and scale > 0, f"applied_scale is {str(scale)[:40]}")
         points, colors = _points(content.get("ply_file_path"), path)
-        found = _photos(path.parent, content, frames)
-        split = [_listed(content.get(key), found, key) for key in _LISTS]
+        found, files = _photos(path.parent, content, frames)
+        split = [_listed(content.get(key), found, files, key) for key in _LISTS]
     train, *others = split
     held_out = [names for names in others if names is not None]
     return Transforms(
@@ -84,39 +87,46 @@ def read_transforms(path: Path) -> Transforms:
 
 
 def _content(path: Path) -> dict[str, Any]:
-    """Read the file, or the files of a split as one that lists its parts."""
+    """Read the file, or the files of a split, parts of which may be empty, as one that lists its parts."""
     if path.name != SPLITS[0]:
         return _file(path)
     beside = {key: path.with_name(name) for key, name in zip(_LISTS, SPLITS, strict=True)}
     parts = {key: _file(part) for key, part in beside.items() if part.exists()}
     lists = {key: [frame["file_path"] for frame in part["frames"]] for key, part in parts.items()}
     frames = [{**part, **frame} for part in parts.values() for frame in part["frames"]]
-    return _file(path) | lists | {"frames": frames}
+    return parts[_LISTS[0]] | lists | {"frames": frames}
 
 
 def _file(path: Path) -> dict[str, Any]:
-    """Read a file and check that it lists photos. Values of null are left out."""
-    content: Any = read_json(path, _MOST_BYTES)
-    frames: Any = content.get("frames") if isinstance(content, dict) else None
-    expect(isinstance(frames, list) and bool(frames), "it lists no photo under frames")
-    expect(all(isinstance(frame, dict) for frame in frames), "a photo is not described by names and values")
-    frames = [{key: value for key, value in frame.items() if value is not None} for frame in frames]
-    expect(all("file_path" in frame for frame in frames), "a photo has no file_path")
-    return {key: value for key, value in content.items() if value is not None} | {"frames": frames}
+    """Read a file and check that it has a list of photos. Values of null are left out."""
+    with readable(f"{path} can't be used", "correct it, or make it again"):
+        content: Any = read_json(path, _MOST_BYTES)
+        frames: Any = content.get("frames") if isinstance(content, dict) else None
+        expect(isinstance(frames, list), "it lists no photo under frames")
+        whole = all(isinstance(frame, dict) for frame in frames)
+        expect(whole, "a photo is not described by names and values")
+        frames = [{key: value for key, value in frame.items() if value is not None} for frame in frames]
+        expect(all("file_path" in frame for frame in frames), "a photo has no file_path")
+        return {key: value for key, value in content.items() if value is not None} | {"frames": frames}
 
 
 _Found = tuple[dict[str, TrackedPhoto], dict[str, Path], dict[str, UserError]]
+_Files = dict[str, str]
 
 
-def _photos(folder: Path, content: Mapping[str, Any], frames: list[dict[str, Any]]) -> _Found:
-    """Find and read the photos and masks that the frames name."""
+def _photos(folder: Path, content: Mapping[str, Any], frames: list[dict[str, Any]]) -> tuple[_Found, _Files]:
+    """Find and read the photos and masks that the frames name; return them, and the photos' files by the
+    frames' names."""
     names = [frame["file_path"] for frame in frames]
     for name in names:
         expect(isinstance(name, str) and name != "", f"file_path is {str(name)[:40]!r}, not a path")
     files, left_out = _resolved(folder, names, "photos", photos_below)
+    if not files:
+        files, left_out = _resolved(folder, names, "photos", smaller_copies)
     wanted = [frame["mask_path"] for frame in frames if isinstance(frame.get("mask_path"), str)]
     masks, bad_masks = _resolved(folder, wanted, "masks", files_below)
     photos, masks_of, scales = dict[str, TrackedPhoto](), dict[str, Path](), list[float]()
+    refused = dict[str, UserError]()
     for frame in frames:
         name, mask = frame["file_path"], frame.get("mask_path")
         if name in left_out:
@@ -124,10 +134,11 @@ def _photos(folder: Path, content: Mapping[str, Any], frames: list[dict[str, Any
         try:
             if name not in files:
                 raise UserError(f"there is no {folder / name}")
-            file = files[name]
-            if file in photos:
-                raise UserError(f"{file} is listed twice")
-            photos[file], scale = _photo(folder, file, {**content, **frame})
+            if (file := files[name]) in refused:
+                raise refused[file]
+            photo, scale = _photo(folder, file, {**content, **frame})
+            if not _alike(photos.setdefault(file, photo), photo):
+                raise UserError(f"{file} is listed twice, with other cameras")
             scales.append(scale)
             if mask is not None:
                 if mask in bad_masks or mask not in masks:
@@ -135,7 +146,9 @@ def _photos(folder: Path, content: Mapping[str, Any], frames: list[dict[str, Any
                 masks_of[file] = folder / masks[mask]
         except UserError as reason:
             left_out[name] = reason
-            photos.pop(files.get(name, ""), None)
+            if name in files:
+                refused[files[name]] = reason
+                photos.pop(files[name], None)
         except (ValueError, TypeError, KeyError) as error:
             what = f"a photo has no {error}" if isinstance(error, KeyError) else str(error)
             raise ValueError(f"photo {name[:80]}: {what}") from error
@@ -144,7 +157,12 @@ def _photos(folder: Path, content: Mapping[str, Any], frames: list[dict[str, Any
             f"{len(scaled)} of {len(scales)} poses in {folder / TRANSFORMS} have axes of other lengths than "
             f"1 (such as {scaled[0]:.3g}); they are normalized"
         )
-    return dict(sorted(photos.items())), masks_of, left_out
+    return (dict(sorted(photos.items())), masks_of, left_out), files
+
+
+def _alike(one: TrackedPhoto, other: TrackedPhoto) -> bool:
+    """Return whether two photos have the same camera."""
+    return one.lens == other.lens and np.array_equal(one.camera_from_world, other.camera_from_world)
 
 
 def _resolved(
@@ -189,14 +207,14 @@ def _check_links(folder: Path, name: str) -> None:
     inside(folder / top if below else folder, str(Path(*below)) if below else top)
 
 
-def _listed(names: Any, found: _Found, key: str) -> frozenset[str] | None:
+def _listed(names: Any, found: _Found, files: _Files, key: str) -> frozenset[str] | None:
     """Return the photos that a list of the file names; None without a list."""
     if names is None:
         return None
     photos, _, left_out = found
     texts = isinstance(names, list) and all(isinstance(name, str) for name in names)
     expect(texts, f"{key} is not a list of names")
-    return listed(names, {*photos, *left_out}, key)
+    return listed([files.get(name, name) for name in names], {*photos, *left_out, *files.values()}, key)
 
 
 def _points(name: Any, path: Path) -> tuple[Float64[Array, "m 3"], UInt8[Array, "m 3"]]:
@@ -232,7 +250,8 @@ def _lens(frame: Mapping[str, Any], path: Path, name: str) -> Lens:
     model = str(frame.get("camera_model", "OPENCV"))
     upper = model.upper()
     fisheye = upper in FISHEYE_MODELS or bool(frame.get("is_fisheye"))  # instant-ngp's form
-    if upper not in _PERSPECTIVE and not fisheye:
+    model = next((key for key in _OTHER_LENSES if frame.get(key)), model)
+    if (upper not in _PERSPECTIVE and not fisheye) or model in _OTHER_LENSES:
         raise UserError(
             f"photo {name} has a {model[:40]} camera, which can't be undistorted here: undistort it first "
             "(colmap image_undistorter; panoramas: ns-process-data images --camera-type equirectangular)"

@@ -178,6 +178,27 @@ def test_lenses_of_instant_ngp_are_fisheyes_where_it_says_so(folder, fisheye):
     assert photo.lens.fisheye == fisheye and photo.lens.distortion[0] == 0.1
 
 
+@pytest.mark.parametrize("key", ["equirectangular", "latlong", "orthographic", "ftheta_p0"])
+def test_other_lenses_of_instant_ngp_are_refused(folder, key):
+    with pytest.raises(UserError, match=f"has a {key} camera"):
+        open_capture(write(folder, top={key: 1}))
+
+
+@pytest.mark.parametrize("times", [2, 3])
+@pytest.mark.parametrize("form", ["images/a.png", "./images/a.png"])
+def test_a_photo_that_is_listed_again_counts_once_if_its_camera_is_the_same(folder, times, form):
+    write(folder)
+    content = json.loads((folder / "transforms.json").read_text())
+    content["frames"] += [content["frames"][0] | {"file_path": form}] * (times - 1)
+    (folder / "transforms.json").write_text(json.dumps(content))
+    found = open_capture(folder)
+    assert found.names == ["images/a.png"] and not found.left_out
+    content["frames"][1] = content["frames"][1] | {"fl_x": 60.0}
+    (folder / "transforms.json").write_text(json.dumps(content))
+    with pytest.raises(UserError, match=r"correct .*transforms\.json.*twice, with other cameras"):
+        open_capture(folder)
+
+
 def test_training_refuses_such_a_scene(folder, train):
     write(folder, fl_x=-50.0)
     with pytest.raises(UserError, match=r"transforms\.json can't be used.*focal"):

@@ -3,6 +3,7 @@
 import json
 import shutil
 import struct
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,7 @@ from lang3dxl_ns.preparation.settings import PreparationConfig
 from lang3dxl_ns.scene import capture
 from lang3dxl_ns.scene.capture import CaptureSettings, open_capture, recorded_capture
 from lang3dxl_ns.scene.colmap import read_reconstruction
-from lang3dxl_ns.scene.frame import Frame, find_frame, lost_cameras
+from lang3dxl_ns.scene.frame import Frame, find_frame, lost_cameras, wrong_cameras
 from lang3dxl_ns.scene.names import name_finder, resolve
 from lang3dxl_ns.scene.ply_points import read_ply_points
 from lang3dxl_ns.scene.reconstruction import CONTRADICTED, LONELY, REPORT
@@ -120,6 +121,13 @@ def test_points_may_lack_colors_and_tracks(folder, capsys):
     assert "no color" in capsys.readouterr().out
 
 
+def test_keypoints_without_a_point_have_none_whatever_number_points_have(folder):
+    points = lambda ls: [x if x[:1] == "#" else f"-1 {x.partition(' ')[2]}" for x in ls if x]  # noqa: E731
+    images = lambda ls: [x if x[:1] == "#" or x.endswith("png") else "4 5 -1" for x in ls if x]  # noqa: E731
+    found = read_reconstruction(as_text(folder, images, points))
+    assert len(found.points) and not any(len(photo.points) for photo in found.photos.values())
+
+
 @pytest.mark.parametrize(
     ("part", "change", "told"),
     [
@@ -178,6 +186,8 @@ def test_ambiguous_and_shared_names_are_refused_and_exact_ones_keep_their_files(
     assert found == {"d.png": "d.png", "E.PNG": "e.png"}
     assert set(refused) == {"b.png", "x/c.jpg", "y/c.jpg"}
     assert "1 of 6 photos have other names than listed: E.PNG is e.png" in capsys.readouterr().out
+    found, refused = resolve(["train/c", "test/c"], files.__contains__, lambda: ["train/c.png"], "photos")
+    assert found == {"train/c": "train/c.png"} and set(refused) == {"test/c"}
 
 
 def test_a_model_of_jpegs_finds_the_same_photos_as_png(folder):
@@ -398,6 +408,46 @@ def test_cameras_and_points_of_no_scene_are_told(folder, capsys, times, moved, t
     open_capture(folder)
     said = capsys.readouterr().out
     assert (told in said) if told else "No scene comes of it" not in said
+
+
+OPENGL = np.diag([1.0, -1, -1])
+
+
+def inverted(view):
+    return np.column_stack([view[:, :3].T, -view[:, :3].T @ view[:, 3]])
+
+
+@pytest.mark.parametrize("tracked", [True, False])
+def test_poses_that_look_away_from_the_points_are_told(folder, tracked):
+    """As exporters write them that confuse the directions of poses, or OpenCV's axes with OpenGL's:
+    they were trained on without a word."""
+    model = read_reconstruction(folder / "sparse" / "0")
+    for change, told in (
+        (lambda view: view, False),
+        (inverted, True),
+        (lambda view: OPENGL @ view, True),
+        (lambda view: inverted(OPENGL @ view), True),
+        (lambda view: OPENGL @ inverted(OPENGL @ view), True),
+    ):
+        photos = [
+            replace(
+                photo, camera_from_world=change(photo.camera_from_world), points=photo.points[: tracked * 99]
+            )
+            for photo in model.photos.values()
+        ]
+        assert ("do not see the points" in str(wrong_cameras(photos, model.points))) == told
+        few = [*photos[:2], *list(model.photos.values())[2:]]
+        assert wrong_cameras(few, model.points) is None  # two photos may be of something else
+
+
+@pytest.mark.parametrize(("times", "told"), [(1, False), (0.01, True), (0.25, True), (2, True)])
+def test_lenses_of_pictures_of_another_size_are_told(folder, times, told, capsys):
+    """As exporters write them that forget to scale the lens with the pictures."""
+    lens = next(iter(read_reconstruction(folder / "sparse" / "0").photos.values())).lens
+    values = {"fl_x": lens.fx, "fl_y": lens.fy, "cx": lens.cx, "cy": lens.cy}
+    write_transforms(folder, **{key: value * times for key, value in values.items()})
+    open_capture(folder / "transforms.json")
+    assert ("pictures of another size" in capsys.readouterr().out) == told
 
 
 @pytest.mark.parametrize("times", [1, 10, 50])

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from scenes import write_scene
+from scenes import write_scene, write_transforms
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.scene.capture import open_capture
@@ -48,6 +48,7 @@ def poses(capture):
         {"sparse/0": "dense/0/sparse", "images": "dense/0/images"},
         {"sparse/0": "undistorted/sparse", "images": "undistorted/images"},
         {"images": "images_4"},
+        {"sparse/0": "gaussian_splat/sparse/0", "images": "gaussian_splat/images_4"},
         {"images": "input"},
     ],
 )
@@ -57,6 +58,48 @@ def test_the_model_and_its_photos_are_found_where_programs_leave_them(stock, sce
     assert poses(capture) == poses(open_capture(stock)) and not capture.left_out
     if "sparse/0" in moves:
         assert f"a COLMAP model in {moves['sparse/0']}, which is used" in capsys.readouterr().out
+
+
+def test_photos_of_an_undistorted_model_lie_beside_it(scene):
+    moved(scene, {"sparse/0": "dense/sparse"})
+    shutil.copytree(scene / "images", scene / "dense" / "images")
+    assert open_capture(scene, may_reconstruct=False).images == scene / "dense" / "images"
+
+
+@pytest.mark.parametrize(
+    ("images", "cameras", "data"),
+    [
+        ("images", "transforms.json", "images"),
+        ("images_4", "transforms.json", "."),
+        ("export/images", "export/transforms.json", "."),
+        ("nerfstudio/images_8", "nerfstudio/transforms.json", "."),
+    ],
+)
+def test_cameras_of_a_transforms_json_are_found_from_any_folder_of_its_scene(
+    stock, scene, images, cameras, data, capsys
+):
+    write_transforms(scene, w=48, h=36)
+    shutil.rmtree(scene / "sparse")
+    for old, new in (("images", images), ("transforms.json", cameras)):
+        (scene / new).parent.mkdir(exist_ok=True)
+        (scene / old).rename(scene / new)
+    found = open_capture(scene / data, may_reconstruct=False)
+    assert found.source == scene / cameras and not found.left_out
+    assert list(poses(found)) == list(poses(open_capture(stock)))
+    assert (data == "." and cameras == "transforms.json") or str(scene) in capsys.readouterr().out
+
+
+def test_a_transforms_json_below_other_photos_is_not_theirs(scene):
+    write_transforms(scene, w=48, h=36)
+    shutil.rmtree(scene / "sparse")
+    for name in ("one", "two"):
+        shutil.copytree(scene / "images", scene / name / "images")
+        shutil.copy(scene / "transforms.json", scene / name)
+    (scene / "transforms.json").unlink()
+    for gone in ("two", "one/transforms.json"):  # two scenes; one, and other photos
+        with pytest.raises(UserError, match="no COLMAP model"):
+            open_capture(scene, may_reconstruct=False)
+        shutil.rmtree(scene / gone, ignore_errors=True)
 
 
 def test_of_several_models_the_largest_is_used_and_the_others_are_told(scene, capsys):
@@ -103,6 +146,13 @@ def test_photos_whose_names_only_look_like_masks_are_photos(scene):
     assert open_capture(scene).photos[0].mask_path is None
 
 
+@pytest.mark.parametrize("folder", ["@eaDir/photo_000.jpg", "#recycle", "$RECYCLE.BIN", "confidence"])
+def test_thumbnails_trash_and_confidences_are_no_photos(scene, folder):
+    (scene / "images" / folder).mkdir(parents=True)
+    shutil.copy(scene / "images" / "photo_000.jpg", scene / "images" / folder / "thumb.jpg")
+    assert len(find_photos(scene).names) == 3
+
+
 def test_a_scene_of_blender_is_one_capture_with_its_split(scene):
     pose = np.eye(4)
     for part, photo in zip(("train", "val", "test"), sorted((scene / "images").iterdir()), strict=True):
@@ -120,6 +170,37 @@ def test_a_scene_of_blender_is_one_capture_with_its_split(scene):
         assert capture.split == (("train/r_0.png",), ("test/r_0.png", "val/r_0.png"))
         wide = {photo.name: photo.lens.fx for photo in capture.photos}
         assert wide["train/r_0.png"] < wide["val/r_0.png"] == wide["test/r_0.png"]
+
+
+@pytest.mark.parametrize("suffix", ["", ".png"])
+@pytest.mark.parametrize("left", ["no test photos", "no test frames", "training's frames"])
+def test_photos_of_blender_are_trained_on_whatever_is_there_of_the_test(scene, suffix, left, capsys):
+    """Exporters write no test photos, and other readers ask for a file of test photos, be it a copy."""
+    top, pose = {"camera_angle_x": 0.8}, np.eye(4)
+    for part in ("train", "test"):
+        frames = []
+        for i in range(2):
+            pose[0, 3] += 1
+            frames += [{"file_path": f"./{part}/r_{i}{suffix}", "transform_matrix": pose.tolist()}]
+            if part == "train":
+                (scene / "train").mkdir(exist_ok=True)
+                Image.new("RGB", (48, 36)).save(scene / "train" / f"r_{i}.png")
+        kept = (
+            {"no test frames": [], "training's frames": None}.get(left, frames) if part == "test" else frames
+        )
+        if kept is not None:
+            (scene / f"transforms_{part}.json").write_text(json.dumps(top | {"frames": kept}))
+        else:
+            shutil.copy(scene / "transforms_train.json", scene / "transforms_test.json")
+    shutil.rmtree(scene / "sparse")
+    shutil.rmtree(scene / "images")
+    capture = open_capture(scene, may_reconstruct=False)
+    assert capture.split == (("train/r_0.png", "train/r_1.png"),) * 2
+    assert [photo.camera_from_world[0, 3] for photo in capture.reconstruction.photos.values()] == [-1, -2]
+    assert ("hold out no photo" in capsys.readouterr().out) == (left != "training's frames")
+    (scene / "transforms_test.json").write_text("{")
+    with pytest.raises(UserError, match=r"transforms_test\.json can't be used"):
+        open_capture(scene, may_reconstruct=False)
 
 
 def test_cameras_that_are_not_read_are_named(scene, capsys):
