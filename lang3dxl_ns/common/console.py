@@ -81,6 +81,8 @@ _KNOWN_WARNINGS = (
     r"`torch\.cuda\.amp\.",  # nerfstudio's trainer and activations
     r"Detected call of `lr_scheduler\.step\(\)` before",  # nerfstudio's optimizers
     r"Converting a tensor with requires_grad=True to a scalar",  # nerfstudio's writer
+    r"Image size \(\d+ pixels\) exceeds limit",  # Pillow, of photos that phones take
+    r"(Possibly c|C)orrupt EXIF data|Palette images with Transparency",  # Pillow
 )
 """Patterns for the beginnings of warnings that are silenced."""
 

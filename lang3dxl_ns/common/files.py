@@ -96,7 +96,7 @@ def replace_file(path: Path, content: str | bytes) -> None:
     replaced file keeps its mode."""
     make_folder(path.parent)
     content = content.encode() if isinstance(content, str) else content
-    temporary = path.with_name(f"{path.name}.{os.getpid()}-{secrets.token_hex(4)}.tmp")
+    temporary = path.with_name(f"{path.name[:50]}.{os.getpid()}-{secrets.token_hex(4)}.tmp")
     try:
         with temporary.open("xb") as file:
             with contextlib.suppress(OSError):  # there is none yet, or the disk has no modes

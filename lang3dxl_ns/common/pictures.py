@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Shaped, UInt8
 from numpy import ndarray as Array
-from PIL import ExifTags, Image
+from PIL import ExifTags, Image, ImageCms
 
 from lang3dxl_ns.common.errors import DAMAGE, in_a_line, not_of_memory
 from lang3dxl_ns.common.files import open_file
@@ -33,6 +33,8 @@ RAW_SUFFIXES = (
 """Suffixes of camera raw files. Pillow takes some for TIFF, and reads their thumbnail."""
 OTHER_SUFFIXES = (".jp2", ".j2k", ".jpx", ".exr", ".hdr", ".psd", ".tga", ".ppm", ".heics", ".insp", ".dds")
 """Suffixes of pictures in other formats, which are never read."""
+_LARGEST_PROFILE = 4 << 20
+"""Largest color profile that is used, bytes; those of printers have up to 3 MB."""
 _BACK = {
     **{2: Image.Transpose.FLIP_LEFT_RIGHT, 3: Image.Transpose.ROTATE_180, 4: Image.Transpose.FLIP_TOP_BOTTOM},
     **{5: Image.Transpose.TRANSPOSE, 6: Image.Transpose.ROTATE_90, 7: Image.Transpose.TRANSVERSE},
@@ -55,6 +57,7 @@ def open_picture(path: Path) -> Iterator[Image.Image]:
         raise NoPictureError(reason)
     try:
         with _opened(path) as image:
+            _check_layout(image)
             yield _as_stored(image)
     except Image.UnidentifiedImageError as error:
         raise NoPictureError(f"not a picture in one of the formats {', '.join(_formats())}") from error
@@ -113,6 +116,17 @@ def _without_text(path: Path) -> bytes:
             kept.append(content[place:end])
         place = end
     return b"".join(kept)
+
+
+def _check_layout(image: Image.Image) -> None:
+    """Raise NoPictureError for a TIFF of which Pillow would read wrong colors, or a thumbnail."""
+    tags = getattr(image, "tag_v2", {}) if image.format == "TIFF" else {}
+    apart = tags.get(ExifTags.Base.PlanarConfiguration) == 2
+    negative = tags.get(ExifTags.Base.PhotometricInterpretation) == 0
+    if (apart or negative) and max(tags.get(ExifTags.Base.BitsPerSample, (1,))) > 8:
+        raise NoPictureError("its 16 bits are stored by channel or as a negative: convert it to JPEG or PNG")
+    if tags.get(ExifTags.Base.NewSubfileType, 0) & 1:
+        raise NoPictureError("its first picture is a thumbnail: export the photo as JPEG or PNG")
 
 
 def _as_stored(image: Image.Image) -> Image.Image:
@@ -188,6 +202,25 @@ def eight_bits(image: Image.Image) -> Image.Image:
         return image
     values = np.asarray(image).clip(0, 65535)
     return Image.fromarray((values / (257 if values.max() > 255 else 1)).round().astype(np.uint8))
+
+
+def rgb_pixels(image: Image.Image) -> Image.Image:
+    """Convert an open picture to 8-bit RGB, in sRGB where it brings a color profile, as photos of phones do.
+    A profile that is damaged, or fits other pixels, doesn't count."""
+    pixels = eight_bits(image)
+    profile = image.info.get("icc_profile")
+    if not profile or len(profile) > _LARGEST_PROFILE:
+        return pixels.convert("RGB")
+    with suppress(*DAMAGE, ImageCms.PyCMSError):
+        source = ImageCms.ImageCmsProfile(io.BytesIO(profile))
+        if "sRGB" not in ImageCms.getProfileDescription(source):
+            pixels = pixels if pixels.mode in ("L", "CMYK", "LAB") else pixels.convert("RGB")
+            converted = ImageCms.profileToProfile(
+                pixels, source, ImageCms.createProfile("sRGB"), outputMode="RGB"
+            )
+            assert converted is not None
+            return converted
+    return pixels.convert("RGB")
 
 
 def color_bytes(colors: Shaped[Array, "n 3"]) -> UInt8[Array, "n 3"]:

@@ -41,7 +41,7 @@ from lang3dxl_ns.scene.masks import mask_folder
 from lang3dxl_ns.scene.matching import shows_these
 from lang3dxl_ns.scene.names import listed, resolve
 from lang3dxl_ns.scene.photo import Photo, stored_size, upright
-from lang3dxl_ns.scene.photo_folder import check_data, find_photos, photos_below
+from lang3dxl_ns.scene.photo_folder import check_data, find_photos, mention_passed_over, photos_below
 from lang3dxl_ns.scene.reconstruct import reconstruct_scene
 from lang3dxl_ns.scene.reconstruction import CONTRADICTED, doubtful_photos, reasons_in_words
 from lang3dxl_ns.scene.record import SceneRecord
@@ -271,6 +271,7 @@ def find_source(
         return reconstruct_scene(folder, cache_dir)
     of_models = (path for part in ("images", "cameras") for path in folder.rglob(f"{part}.[bt]*"))
     if may_reconstruct and not any(of_models):
+        mention_passed_over(folder)
         lacks = "holds no photos and no COLMAP model" if any(folder.iterdir()) else "is empty"
         raise UserError(f"{folder} {lacks}: give the folder with your photos (then lang3dxl reconstruct)")
     return folder, folder / MODEL_FOLDERS[0]  # reading it tells what is missing

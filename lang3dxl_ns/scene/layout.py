@@ -32,11 +32,19 @@ _OTHER_CAMERAS = {
     **{"keyframes/corrected_cameras": "Polycam", "metadata.json": "Record3D"},
 }
 """Files and folders with cameras that can't be read here, and the programs that write them."""
+_MARKS = {"*.xmp": "capturingreality", "metadata.json": '"poses"'}
+"""Texts in such files whose names others have too: those of photo editors, and of Google's archives."""
 
 
 def has_model(folder: Path) -> bool:
     """Return whether a folder has a file of photos of a COLMAP model."""
     return any((folder / f"images{ending}").is_file() for ending in (".bin", ".txt"))
+
+
+def _has_more(folder: Path) -> bool:
+    """Return whether a folder has another file of a COLMAP model than that of photos."""
+    parts = (f"{part}{ending}" for part in ("cameras", "points3D") for ending in (".bin", ".txt"))
+    return any((folder / part).is_file() for part in parts)
 
 
 def whole_scene(folder: Path) -> Path:
@@ -75,7 +83,8 @@ def find_model(folder: Path) -> Path | None:
     """Find the COLMAP model of a scene's folder: in the usual places, else the largest one below it, which is
     said with the others; None without one."""
     for place in MODEL_FOLDERS:
-        if has_model(folder / place):
+        # Among photos, images.txt may as well be a list of their addresses.
+        if has_model(folder / place) and (place.name or _has_more(folder)):
             return folder / place
     found = {model: photos_in_model(model) for model in _models_below(folder)}
     if not found:
@@ -120,12 +129,19 @@ def images_folder(data: Path, model: Path, named: Path = _IMAGES) -> Path:
 def mention_other_cameras(folder: Path) -> None:
     """Say which cameras of other programs lie beside photos that are reconstructed anew."""
     for pattern, program in _OTHER_CAMERAS.items():
-        if (found := next(folder.glob(pattern), None)) is not None:
+        mark = _MARKS.get(pattern)
+        if found := next((path for path in folder.glob(pattern) if not mark or _says(path, mark)), None):
             say(
                 f"{found} holds cameras of {program}, which can't be read here: the photos are reconstructed "
                 "anew. To use them, export a COLMAP model or a transforms.json (ns-process-data) beside it"
             )
     for path in folder.glob("*.json"):
-        with suppress(*DAMAGE):
-            if '"transform_matrix"' in read_text(path):
-                say(f"{path} holds cameras, too: to use them, give this file instead of its folder")
+        if _says(path, '"transform_matrix"'):
+            say(f"{path} holds cameras, too: to use them, give this file instead of its folder")
+
+
+def _says(path: Path, text: str) -> bool:
+    """Return whether a file can be read and has a text in it."""
+    with suppress(*DAMAGE):
+        return text in read_text(path)
+    return False

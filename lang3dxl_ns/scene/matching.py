@@ -43,6 +43,8 @@ _ENDINGS = {"JPEG": ".jpg", "MPO": ".jpg", "PNG": ".png", "TIFF": ".tif", "BMP":
 _QUALITY = 98
 _BYTES_PER_FEATURE = 170  # in the database, with its part of the matches
 _MOST_EXIF = 65_533  # bytes that a JPEG holds
+_LENSES, _USUAL_LENS = (0.2, 10.0), 1.2
+"""Focal lengths that lenses have, and that which COLMAP guesses, relative to the longer side."""
 _CHUNK_PHOTOS, _CHUNK_PAIRS, _CHUNK_LEARNED = 8, 100, 5  # a step of the bar, which a killed process loses
 _STAMP = "photos.json"
 _TABLES = {"keypoints": 4, "descriptors": 1, "matches": 4, "two_view_geometries": 4}
@@ -118,6 +120,7 @@ def feature_database(
     for group in groups:
         numbers = [number[name] for name in group]
         pycolmap.import_images(importing, copies.folder, pycolmap.CameraMode.SINGLE, numbers)
+    _correct_lenses(importing)
     if settings.one_camera:  # COLMAP passes over photos of another size, and later gives each its own
         with pycolmap.Database.open(importing) as db:
             odd = [name for name in photos.names if not db.exists_image(number[name])]
@@ -134,6 +137,17 @@ def feature_database(
     importing.rename(database)
     replace_file(stamped, stamp)
     return database
+
+
+def _correct_lenses(database: Path) -> None:
+    """Replace focal lengths that no lens has by the usual guess: COLMAP takes EXIF's resolutions of 0 and
+    lenses of 1 or 65,535 mm as they are, and then finds no place for the photos."""
+    with load_pycolmap().Database.open(database) as db:
+        for camera in db.read_all_cameras():
+            side = max(camera.width, camera.height)
+            if not _LENSES[0] <= camera.focal_length / side <= _LENSES[1]:
+                camera.focal_length, camera.has_prior_focal_length = _USUAL_LENS * side, False
+                db.update_camera(camera)
 
 
 def _keep_features(folder: Path, database: Path, wanted: dict[str, str], made: Sequence[str | int]) -> None:

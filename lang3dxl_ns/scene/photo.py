@@ -23,7 +23,7 @@ from PIL import ExifTags, Image
 from torch import Tensor
 
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.common.pictures import NoPictureError, eight_bits, mask_values, open_picture, see_through
+from lang3dxl_ns.common.pictures import NoPictureError, mask_values, open_picture, rgb_pixels, see_through
 from lang3dxl_ns.scene.camera import HasLens, Lens, scaled_size
 
 if TYPE_CHECKING:
@@ -143,7 +143,7 @@ class Photo(HasLens):
         with _readable(self.path, self.name), open_picture(self.path) as file:
             if file.width * file.height > _LARGE:
                 file.draft(None, _turned_size(at_least, self.quarter_turns))  # does nothing for other formats
-            image = eight_bits(file).convert("RGB")
+            image = rgb_pixels(file)
         return image.transpose(_TURNS[self.quarter_turns]) if self.quarter_turns else image
 
     def _drawn_upright(self, drawn: Any) -> Any:

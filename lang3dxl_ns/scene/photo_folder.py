@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 from PIL import ExifTags, Image
 
-from lang3dxl_ns.common.console import tracked
+from lang3dxl_ns.common.console import say, some, tracked
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.common.files import expanded
+from lang3dxl_ns.common.files import expanded, open_file
 from lang3dxl_ns.common.pictures import (
     OTHER_SUFFIXES,
     PHOTO_SUFFIXES,
@@ -24,7 +24,7 @@ from lang3dxl_ns.common.pictures import (
 )
 from lang3dxl_ns.scene.masks import photos_of_mask
 from lang3dxl_ns.scene.reconstruction import PICTURE, REPORT
-from lang3dxl_ns.scene.video import frames_folder, is_video
+from lang3dxl_ns.scene.video import VIDEO_SUFFIXES, frames_folder, is_video
 
 IMAGE_FOLDERS = (Path("images"), Path("dense/images"))
 _SMALLER = ("images_2", "images_4", "images_8")
@@ -33,9 +33,12 @@ _NOT_PHOTOS = {
     *_SMALLER,
     *("masks", "mask", "segments", "depth", "depths", "normals", "ground_truth", "labels", "sparse", "dense"),
     *("lang3dxl_cache", "outputs", "renders", "colmap", "confidence"),
-    *("@eadir", "#recycle", "$recycle.bin"),
+    *("@eadir", "#recycle", "@recycle", "#snapshot", "$recycle.bin", "lost+found", "thumbnails", "thumbs"),
 }
 _KNOWN = (*PHOTO_SUFFIXES, *RAW_SUFFIXES, *OTHER_SUFFIXES)
+_ARCHIVES = (".zip", ".rar", ".7z", ".tar", ".gz", ".tgz", ".livp")
+_BEGINNINGS = re.compile(rb"\xff\xd8\xff|\x89PNG\r\n|GIF8|RIFF....WEBP|....ftyp(hei|mif1|avif)", re.DOTALL)
+"""First bytes of pictures that are read."""
 _OWN = re.compile(r"\.[0-9a-f]{16}\.(png|jpg)$")
 """Ends of the names of pictures in a feature store, which --cache-dir may put into the photos' folder."""
 _PHONE_PANORAMA = 6
@@ -59,7 +62,7 @@ def find_photos(data: Path) -> PhotoFolder:
     otherwise all in the folder and its sub-folders, except masks, results and the like. Links to folders are
     not followed. Raises UserError for a folder that doesn't exist."""
     if not data.is_dir():
-        raise UserError(f"{data} is not a folder: give the folder with your photos, or a video")
+        raise _no_place(data)
     found = (PhotoFolder(f, tuple(photos_below(f))) for f in (*map(data.joinpath, IMAGE_FOLDERS), data))
     return next((photos for photos in found if photos.names), PhotoFolder(data, ()))
 
@@ -69,13 +72,60 @@ def check_data(data: Path | None) -> None:
     place = Path() if data is None else expanded(data)
     known = is_video(place) or (place.is_file() and place.suffix == ".json")
     if not (known or place.is_dir() or frames_folder(place).is_dir()):
-        raise UserError(f"{data} is not a folder: give the folder with your photos, or a video")
+        raise _no_place(place)
+
+
+def _no_place(data: Path) -> UserError:
+    if data.is_file():
+        kinds = f"a video ({', '.join(VIDEO_SUFFIXES)})"
+        return UserError(f"{data} is neither a folder nor {kinds}: unpack or convert it, and give the result")
+    return UserError(f"{data} is not a folder: give the folder with your photos, or a video")
+
+
+def mention_passed_over(folder: Path) -> None:
+    """Say what lies among a folder's photos and isn't read, though it may hold some."""
+    found: dict[str, list[str]] = {}
+
+    def closed(error: OSError) -> None:
+        found.setdefault("folders that you may not read (allow it, or copy them)", []).append(error.filename)
+
+    for parent, folders, files in os.walk(folder, onerror=closed):
+        folders[:] = filter(_may_hold_photos, folders)
+        links = "links to folders, which are not followed (copy the photos)"
+        found.setdefault(links, []).extend(f for f in folders if Path(parent, f).is_symlink())
+        stems = {Path(file).stem for file in files if Path(file).suffix.lower() in _KNOWN}
+        for path in (Path(parent, file) for file in files):
+            if what := _passed_over(path, stems):
+                found.setdefault(what, []).append(path.relative_to(folder).as_posix())
+    for what, names in found.items():
+        if names:
+            say(f"{folder} also holds {len(names)} {what}: {some(sorted(names), 3)}")
+
+
+def _passed_over(path: Path, photos: Collection[str]) -> str | None:
+    """Say what a file is, if it may hold photos and is none that is read. `photos` are the stems of those
+    beside it: phones keep a short video with each."""
+    suffix = path.suffix.lower()
+    if path.name.startswith("."):
+        return "photos that are only in iCloud (download them)" if suffix == ".icloud" else None
+    if suffix in _ARCHIVES:
+        return "archives (unpack them)"
+    if suffix in VIDEO_SUFFIXES:
+        live = path.stem in photos or path.stem.removesuffix("_HEIC") in photos
+        also = "videos (give one instead of the folder, or later add it: lang3dxl reconstruct --add)"
+        return None if live or frames_folder(path).is_dir() else also
+    if suffix in (*_KNOWN, ".thm") or suffix.endswith("_original"):
+        return None
+    with suppress(OSError), open_file(path) as file:
+        if _BEGINNINGS.match(file.read(16)):
+            return "pictures under other endings (call them .jpg)"
+    return None
 
 
 def shared_cameras(photos: PhotoFolder) -> list[list[str]]:
-    """Group the names by camera and lens: by maker, model, focal length and size. Photos without EXIF share a
-    camera if all of their folder have the same size, as frames of a video have; otherwise each has its
-    own."""
+    """Group the names by camera and lens: by maker, model, focal length with zoom, and size. Photos without
+    EXIF share a camera if all of their folder have the same size, as frames of a video have; otherwise each
+    has its own."""
     groups: dict[tuple, list[str]] = {}
     silent: dict[Path, dict[str, tuple[int, int]]] = {}
     for name in photos.names:
@@ -149,7 +199,7 @@ def photos_below(folder: Path) -> list[str]:
     masks, in folders of their own or beside their photos."""
     names = []
     for parent, folders, files in os.walk(folder):
-        folders[:] = [f for f in folders if f.lower() not in _NOT_PHOTOS and not f.startswith((".", "_"))]
+        folders[:] = filter(_may_hold_photos, folders)
         if Path(parent).name in ("reconstruction", "adding"):
             folders[:] = [f for f in folders if f != "numbered"]
             files = [f for f in files if f != PICTURE.name or REPORT.name not in files]
@@ -172,6 +222,11 @@ def smaller_copies(folder: Path) -> list[str]:
     return next(filter(None, found), [])
 
 
+def _may_hold_photos(folder: str) -> bool:
+    """Return whether a sub-folder of this name is searched for photos."""
+    return folder.lower() not in _NOT_PHOTOS and not folder.startswith((".", "_"))
+
+
 def files_below(folder: Path) -> Iterator[str]:
     """Yield all regular files in a folder and its sub-folders, without hidden ones and the cache."""
     for parent, folders, files in os.walk(folder):
@@ -188,7 +243,9 @@ def _size_and_lens(path: Path) -> tuple[tuple[int, int], tuple | None]:
         with suppress(Exception):  # damaged EXIF, which may hold anything
             exif = image.getexif()
             details = exif.get_ifd(ExifTags.IFD.Exif)
-            focal = details.get(ExifTags.Base.FocalLengthIn35mmFilm) or details.get(ExifTags.Base.FocalLength)
+            zoom = float(details.get(ExifTags.Base.DigitalZoomRatio) or 1)
+            focal = details.get(ExifTags.Base.FocalLengthIn35mmFilm)
+            focal = focal or zoom * float(details.get(ExifTags.Base.FocalLength, 0))
             body = exif.get(ExifTags.Base.Make), exif.get(ExifTags.Base.Model)
             if any(body) and focal:
                 return size, (*map(str, body), float(focal))

@@ -37,7 +37,7 @@ from lang3dxl_ns.scene.matching import (
     quiet,
     usable,
 )
-from lang3dxl_ns.scene.photo_folder import PhotoFolder, find_photos
+from lang3dxl_ns.scene.photo_folder import PhotoFolder, find_photos, mention_passed_over
 from lang3dxl_ns.scene.placements import (
     LEAST_MATCHES,
     SOUND,
@@ -196,6 +196,7 @@ def reconstruct_scene(
     if is_video(data):
         data = extract_frames(data)
     photos = find_photos(data)
+    mention_passed_over(data)
     work = work_folder(data, cache_dir)
     model = data / "sparse"
     if not os.access(data, os.W_OK) or (model.exists() and not model_in(model)):

@@ -21,7 +21,9 @@ from lang3dxl_ns.common.errors import DAMAGE, UserError
 from lang3dxl_ns.common.files import locked, own, read_json, replace_file
 from lang3dxl_ns.scene.companions import cache_folder
 
-VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mts")
+VIDEO_SUFFIXES = (
+    *(".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mts", ".m2ts", ".ts", ".mpg", ".mpeg", ".3gp"),
+)
 FRAMES_PER_SECOND = 2.0
 MOST_FRAMES = 300
 """Maximum number of frames; the rate is reduced for a long video."""
@@ -32,6 +34,8 @@ _MOST_CHANGE = 95
 
 _READING = ("-v", "error", "-protocol_whitelist", "file", "-format_whitelist", "mov,matroska,avi,mpegts,mpeg")
 """Options of ffmpeg for untrusted files: a playlist, for example, could name other files and addresses."""
+_HDR = ("arib-std-b67", "smpte2084")
+"""What ffmpeg calls the transfer of HLG and PQ, as phones film unless told otherwise."""
 _RESIZED = re.compile(r"w: (\d+) h: (\d+) fmt:[^,]*, incoming frame - w: (?!\1 h: \2 )(\d+) h: (\d+) ")
 """What ffmpeg warns of where a frame's size is not the first one's."""
 _SILENT = subprocess.DEVNULL  # ffmpeg takes what is typed, or a script's own input, for commands
@@ -43,8 +47,9 @@ def _reading(program: str, video: Path) -> list[str]:
 
 
 def _each(filters: str) -> list[str]:
-    """Return options of ffmpeg that write each frame that the filters leave once. (-fps_mode came in 5.1.)"""
-    return ["-an", "-vf", f"{filters},settb=1/25,setpts=N", "-r", "25"]
+    """Return options of ffmpeg that write each frame that the filters leave once, without the combs of an
+    interlaced one. (-fps_mode came in 5.1.)"""
+    return ["-an", "-vf", f"yadif=deint=interlaced,{filters},settb=1/25,setpts=N", "-r", "25"]
 
 
 def is_video(path: Path) -> bool:
@@ -135,7 +140,9 @@ def _looks(video: Path) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
 
 def _duration(video: Path) -> float:
     """Return a video's length in seconds: as it says, or from its frames' times where it does not."""
-    found = _probed(video, "stream=codec_type:format=duration")
+    found = _probed(video, "stream=codec_type,color_transfer:format=duration")
+    if found["streams"][0].get("color_transfer") in _HDR:
+        say(f"{video.name} is HDR, whose colors come out pale: for true ones, export it as SDR and give that")
     told = found.get("format", {}).get("duration")
     if told is not None:
         return float(told)

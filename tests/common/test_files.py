@@ -65,3 +65,11 @@ def test_links_in_a_circle_are_told_with_what_helps_and_stay(tmp_path, change):
         change(tmp_path / "a")
     assert "remove them" in disk_trouble(error.value)
     assert (tmp_path / "a").is_symlink() and (tmp_path / "b").is_symlink()
+
+
+@pytest.mark.parametrize("letter", ["a", "é", "🏰"])
+def test_a_file_whose_name_fills_what_the_disk_allows_is_written(tmp_path, letter):
+    """As names of downloads that hold a whole sentence."""
+    name = letter * ((255 - 4) // len(letter.encode())) + ".jpg"
+    write_atomically(tmp_path / name, "words")
+    assert [path.name for path in tmp_path.iterdir()] == [name]

@@ -21,7 +21,7 @@ from lang3dxl_ns.plugin.datamanager import Lang3DXLDataManagerConfig
 from lang3dxl_ns.plugin.dataparser import PhotoCollectionDataParserConfig, parser_for
 from lang3dxl_ns.scene.capture import Capture
 from lang3dxl_ns.scene.layout import images_folder
-from lang3dxl_ns.scene.video import _RESIZED, _looks, _sharpest, _write, extract_frames
+from lang3dxl_ns.scene.video import _RESIZED, _duration, _looks, _sharpest, _write, extract_frames
 
 needs_ffmpeg = pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="ffmpeg is not installed")
 
@@ -212,6 +212,36 @@ def test_each_frame_of_a_video_is_looked_at_and_written_once(tmp_path, name, rat
     assert len(sharpness) == (40 if "select" in filters else 60)
     _write(tmp_path / name, tmp_path / "frames", np.arange(len(sharpness)))
     assert len(list((tmp_path / "frames/images").iterdir())) == len(sharpness)
+
+
+@needs_ffmpeg
+@pytest.mark.parametrize("fields", ["null", "interlace=lowpass=0"], ids=["whole", "interlaced"])
+def test_an_interlaced_video_has_frames_without_combs(tmp_path, fields):
+    """Stripes that move sideways: rows of one moment are alike."""
+    graph = (
+        f"color=black:size=64x48:rate=50,format=gray,geq=lum='128+100*sin(X/5+N)',{fields},trim=end_frame=9"
+    )
+    how = ["-c:v", "mpeg2video", "-q:v", "1", *(["-flags", "+ildct+ilme"] if fields != "null" else [])]
+    subprocess.run(
+        ["ffmpeg", "-v", "error", "-f", "lavfi", "-i", graph, *how, str(tmp_path / "a.mpg")], check=True
+    )
+    _write(tmp_path / "a.mpg", tmp_path / "frames", np.arange(2, 6))
+    for path in (tmp_path / "frames/images").iterdir():
+        with Image.open(path) as image:
+            rows = np.asarray(image.convert("L")).astype(float)
+        assert np.abs(np.diff(rows, axis=0)).mean() < 5 < np.abs(np.diff(rows, axis=1)).mean()
+
+
+@needs_ffmpeg
+@pytest.mark.parametrize(
+    ("transfer", "pale"), [("arib-std-b67", True), ("smpte2084", True), ("bt709", False)]
+)
+def test_that_a_video_is_hdr_is_told(tmp_path, transfer, pale, capsys):
+    graph = ["-f", "lavfi", "-i", "testsrc=size=64x48:rate=5,trim=end_frame=5"]
+    how = ["-c:v", "ffv1", "-color_trc", transfer]
+    subprocess.run(["ffmpeg", "-v", "error", *graph, *how, str(tmp_path / "a.mkv")], check=True)
+    assert _duration(tmp_path / "a.mkv") == pytest.approx(1, abs=0.3)
+    assert ("a.mkv is HDR" in capsys.readouterr().out) is pale
 
 
 @needs_ffmpeg

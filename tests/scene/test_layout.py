@@ -11,7 +11,7 @@ from scenes import write_scene, write_transforms
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.scene.capture import open_capture
-from lang3dxl_ns.scene.layout import mention_other_cameras
+from lang3dxl_ns.scene.layout import find_model, mention_other_cameras
 from lang3dxl_ns.scene.photo_folder import find_photos
 
 
@@ -214,3 +214,33 @@ def test_cameras_that_are_not_read_are_named(scene, capsys):
     mention_other_cameras(scene)
     assert "transform.json holds cameras, too" in (told := capsys.readouterr().out)
     assert "notes" not in told
+
+
+@pytest.mark.parametrize(
+    ("name", "content"), [("a.xmp", '<x xmlns:crs="camera-raw"/>'), ("metadata.json", '{"title": "Rome"}')]
+)
+def test_notes_of_photo_editors_and_archives_are_no_cameras(scene, capsys, name, content):
+    (scene / name).write_text(content)
+    mention_other_cameras(scene)
+    assert not capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "program"),
+    [
+        ("a.xmp", '<x xmlns:xcr="http://www.capturingreality.com/ns/xcr/1.1#"/>', "RealityScan"),
+        ("metadata.json", '{"poses": []}', "Record3D"),
+    ],
+)
+def test_cameras_under_names_that_others_have_too_are_named(scene, capsys, name, content, program):
+    (scene / "0.xmp").write_text("<x/>")
+    (scene / name).write_text(content)
+    mention_other_cameras(scene)
+    assert f"{name} holds cameras of {program}" in " ".join(capsys.readouterr().out.split())
+
+
+def test_a_list_of_addresses_among_photos_is_no_model(tmp_path):
+    (tmp_path / "images.txt").write_text("https://example.org/a.jpg")
+    assert find_model(tmp_path) is None
+    (tmp_path / "points3D.txt").touch()
+    assert find_model(tmp_path) == tmp_path  # of which a part is missing

@@ -4,7 +4,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from PIL import Image
+from PIL import Image, ImageCms
 from scenes import texture, write_scene
 
 from lang3dxl_ns.common.errors import UserError
@@ -99,6 +99,36 @@ def test_of_an_animation_the_first_picture_is_read(tmp_path, ending):
     first.save(tmp_path / f"a.{ending}", save_all=True, append_images=[second])
     assert Image.open(tmp_path / f"a.{ending}").n_frames == 2
     assert make_photo(tmp_path / f"a.{ending}").read().min() > 0.95
+
+
+def swapped_profile() -> bytes:
+    """Return a profile of sRGB in which the first number of a pixel means green, and the second red."""
+    profile = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+    name = "sRGB".encode("utf-16-be")
+    profile = profile.replace(name, "Swap".encode("utf-16-be"))
+    return profile.replace(b"rXYZ", b"tXYZ", 1).replace(b"gXYZ", b"rXYZ", 1).replace(b"tXYZ", b"gXYZ", 1)
+
+
+@pytest.mark.parametrize("ending", [".png", ".jpg", ".webp", ".tif", ".avif"])
+@pytest.mark.parametrize("mode", ["RGB", "RGBA"])
+def test_colors_are_those_that_the_color_profile_means(tmp_path, ending, mode):
+    kept = "RGB" if ending == ".jpg" else mode
+    path = tmp_path / f"a{ending}"
+    image = Image.new("RGB", (16, 12), (200, 60, 20)).convert(kept)
+    image.save(path, icc_profile=swapped_profile(), quality=95)
+    read = make_photo(path, 16, 12).read_uint8().float().mean(dim=(0, 1))
+    assert torch.allclose(read, torch.tensor([60.0, 200, 20]), atol=4)
+
+
+@pytest.mark.parametrize("profile", [b"", b"none", b"\0" * 300, b"gray", b"sRGB"])
+def test_a_profile_that_means_nothing_changes_nothing(tmp_path, profile):
+    if profile == b"gray":  # of pixels of another kind
+        profile = swapped_profile().replace(b"RGB XYZ", b"GRAYXYZ", 1)
+    if profile == b"sRGB":
+        profile = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+    pixels = np.random.default_rng(0).integers(0, 256, (12, 16, 3), np.uint8)
+    Image.fromarray(pixels).save(tmp_path / "a.png", icc_profile=profile)
+    assert (make_photo(tmp_path / "a.png", 16, 12).read_uint8().numpy() == pixels).all()
 
 
 def test_without_a_model_that_was_turned_pixels_are_read_as_stored(tmp_path):

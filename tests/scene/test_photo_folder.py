@@ -1,16 +1,26 @@
 """Photos are found where people put them; those of one camera share it."""
 
+import os
 from itertools import pairwise
 
 import numpy as np
 import pytest
 from PIL import ExifTags, Image
+from PIL.TiffImagePlugin import IFDRational
+from pycolmap import Database
 
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.scene import pairing
 from lang3dxl_ns.scene.matching import extract, feature_database
 from lang3dxl_ns.scene.pairing import pairs_that_share, pairs_to_match, similar_pairs
-from lang3dxl_ns.scene.photo_folder import find_photos, readable, shared_cameras, walks
+from lang3dxl_ns.scene.photo_folder import (
+    check_data,
+    find_photos,
+    mention_passed_over,
+    readable,
+    shared_cameras,
+    walks,
+)
 from lang3dxl_ns.scene.reconstruction import ReconstructionSettings
 
 
@@ -124,6 +134,17 @@ def test_exif_tells_cameras_and_zooms_apart(tmp_path):
     assert groups(tmp_path) == [["a.jpg", "b.jpg"], ["other.jpg"], ["turned.jpg"], ["zoomed.jpg"]]
 
 
+def test_what_a_camera_enlarged_by_itself_has_another_lens(tmp_path):
+    for name, zoom, wide in [("a", None, 0), ("b", 1.0, 0), ("c", 2.0, 0), ("d", 2.0, 0), ("e", 2.0, 70)]:
+        exif = Image.Exif()
+        exif[ExifTags.Base.Model] = "X"
+        told = {ExifTags.Base.FocalLength: 6.0, ExifTags.Base.DigitalZoomRatio: zoom}
+        told[ExifTags.Base.FocalLengthIn35mmFilm] = wide  # which the zoom is a part of
+        exif.get_ifd(ExifTags.IFD.Exif).update({tag: value for tag, value in told.items() if value})
+        Image.new("RGB", (8, 6)).save(tmp_path / f"{name}.jpg", exif=exif)
+    assert groups(tmp_path) == [["a.jpg", "b.jpg"], ["c.jpg", "d.jpg"], ["e.jpg"]]
+
+
 def test_few_photos_are_matched_all_with_all():
     assert pairs_to_match(["a", "b", "c"], None, "abc", []) == [("a", "b"), ("a", "c"), ("b", "c")]
 
@@ -215,3 +236,101 @@ def test_a_photo_that_was_not_copied_to_its_end_is_named(tmp_path, suffix, kept)
     good, bad = readable(find_photos(tmp_path))
     assert good.names == (f"whole{suffix}",)
     assert "damaged" in bad[f"cut{suffix}"]
+
+
+PLANE = ExifTags.Base.FocalPlaneXResolution, ExifTags.Base.FocalPlaneYResolution
+
+
+@pytest.mark.parametrize(
+    "told",
+    [
+        {ExifTags.Base.FocalLengthIn35mmFilm: 1},
+        {ExifTags.Base.FocalLengthIn35mmFilm: 65535},
+        dict.fromkeys(PLANE, IFDRational(0, 1)),
+        dict.fromkeys(PLANE, IFDRational(0, 0)),
+    ],
+)
+def test_a_focal_length_that_no_lens_has_is_none(tmp_path, told):
+    """As scanners, adapters and editors write them; COLMAP would begin with a lens of 0 or of none."""
+    exif = Image.Exif()
+    exif[ExifTags.Base.Make] = exif[ExifTags.Base.Model] = "X"
+    focal = {ExifTags.Base.FocalLength: 50.0, ExifTags.Base.FocalPlaneResolutionUnit: 2}
+    exif.get_ifd(ExifTags.IFD.Exif).update(focal | told)
+    Image.new("RGB", (320, 240)).save(tmp_path / "a.jpg", exif=exif)
+    photos = find_photos(tmp_path)
+    with Database.open(feature_database(photos, photos, tmp_path, ReconstructionSettings())) as db:
+        (camera,) = db.read_all_cameras()
+    assert camera.focal_length == 1.2 * 320 and not camera.has_prior_focal_length
+
+
+def test_a_focal_length_that_exif_tells_is_begun_with(tmp_path):
+    exif = Image.Exif()
+    exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.FocalLengthIn35mmFilm] = 26
+    Image.new("RGB", (400, 300)).save(tmp_path / "a.jpg", exif=exif)
+    photos = find_photos(tmp_path)
+    with Database.open(feature_database(photos, photos, tmp_path, ReconstructionSettings())) as db:
+        (camera,) = db.read_all_cameras()
+    assert camera.focal_length == pytest.approx(26 / 43.27 * 500, rel=1e-3) and camera.has_prior_focal_length
+
+
+@pytest.mark.parametrize("place", ["@eaDir/a.jpg", "day/@eaDir", "#recycle", "$RECYCLE.BIN", "Thumbnails"])
+def test_thumbnails_and_deleted_photos_are_no_photos(tmp_path, place, capsys):
+    for file in ("day/a.jpg", f"{place}/SYNOPHOTO_THUMB_XL.jpg"):
+        put(tmp_path / file)
+    assert find_photos(tmp_path).names == ("day/a.jpg",)
+    mention_passed_over(tmp_path)
+    assert not capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("file", "content", "told"),
+    [
+        ("tour.MOV", b"", "1 videos (give one instead of the folder, or later add it: lang3dxl recon"),
+        ("takeout-001.zip", b"", "1 archives (unpack them): takeout-001.zip"),
+        (".b.HEIC.icloud", b"", "1 photos that are only in iCloud (download them): .b.HEIC.icloud"),
+        ("day/b.jpg_large", b"\xff\xd8\xff\xe0", "1 pictures under other endings (call them .jpg): day/b"),
+        ("b.jpg?width=800", b"\x89PNG\r\n", "1 pictures under other endings (call them .jpg): b.jpg?"),
+        ("b", b"RIFF\n\0\0\0WEBPVP8 ", "1 pictures under other endings (call them .jpg): b"),
+        ("b.jpg.json", b"{}", ""),  # of Google's archives
+        ("a.MP4", b"", ""),  # of a phone's photo that moves
+        ("a_HEIC.MOV", b"", ""),
+        ("a.THM", b"\xff\xd8\xff\xe0", ""),
+        ("a.jpg_original", b"\xff\xd8\xff\xe0", ""),
+        ("._a.jpg", b"\0\5\x16\7", ""),
+        ("Thumbs.db", b"\xd0\xcf\x11\xe0", ""),
+        ("a.xmp", b"<x:xmpmeta/>", ""),
+    ],
+)
+def test_what_is_passed_over_though_it_may_hold_photos_is_told(tmp_path, file, content, told, capsys):
+    put(tmp_path / "a.jpg")
+    (tmp_path / file).parent.mkdir(exist_ok=True)
+    (tmp_path / file).write_bytes(content)
+    assert find_photos(tmp_path).names == ("a.jpg",)
+    mention_passed_over(tmp_path)
+    said = " ".join(capsys.readouterr().out.split())
+    assert told in said and bool(told) == bool(said)
+
+
+def test_links_to_folders_and_folders_that_may_not_be_read_are_told(tmp_path, capsys, monkeypatch):
+    put(tmp_path / "scene/a.jpg")
+    put(tmp_path / "elsewhere/b.jpg")
+    (tmp_path / "scene/more").symlink_to(tmp_path / "elsewhere")
+    walk = os.walk
+
+    def closed(top, onerror=None):
+        yield from walk(top, onerror=onerror)
+        onerror(PermissionError(13, "no", "closed"))
+
+    monkeypatch.setattr(os, "walk", closed)
+    mention_passed_over(tmp_path / "scene")
+    told = " ".join(capsys.readouterr().out.split())
+    assert "1 links to folders, which are not followed (copy the photos): more" in told
+    assert "1 folders that you may not read (allow it, or copy them): closed" in told
+
+
+@pytest.mark.parametrize("name", ["takeout.zip", "old.wmv"])
+def test_a_file_that_is_no_folder_of_photos_is_told_with_the_way_out(tmp_path, name):
+    (tmp_path / name).touch()
+    for look in (find_photos, check_data):
+        with pytest.raises(UserError, match=rf"{name} is neither a folder nor a video .*unpack or convert"):
+            look(tmp_path / name)

@@ -1,11 +1,12 @@
 """Pictures and masks of every kind, as cameras and other programs leave them."""
 
 import base64
+import io
 import zlib
 
 import numpy as np
 import pytest
-from PIL import ExifTags, Image, PngImagePlugin
+from PIL import ExifTags, Image, PngImagePlugin, TiffImagePlugin
 
 from lang3dxl_ns.common.pictures import mask_values, open_picture
 from lang3dxl_ns.scene.capture import open_capture
@@ -148,6 +149,51 @@ def test_a_tiff_is_read_as_stored(tmp_path, orientation, compression):
     with open_picture(tmp_path / "a.tif") as image:
         assert image.size == (10, 6) and image.getexif().get(0x112) == orientation
         assert (np.asarray(image.convert("RGB")) == pixels).all()
+
+
+def write_tiff(path, pixels, planar=1, negative=False, kind=0):
+    """Write a TIFF of one strip, or of one per channel."""
+    height, width, channels = pixels.shape
+    strips = [
+        np.ascontiguousarray(part).tobytes()
+        for part in (np.moveaxis(pixels, 2, 0) if planar > 1 else [pixels])
+    ]
+    bits, sizes = (8 * pixels.itemsize,) * channels, [len(strip) for strip in strips]
+    tags = {254: kind, 256: width, 257: height, 258: bits, 259: 1, 277: channels, 278: height, 284: planar}
+    tags |= {262: 2 if channels == 3 else 0 if negative else 1, 279: tuple(sizes)}
+    tags |= {273: tuple(sum(sizes[:i]) for i in range(len(sizes)))}  # counted from the end of the tags
+    content, directory = io.BytesIO(), TiffImagePlugin.ImageFileDirectory_v2()
+    for tag, value in tags.items():
+        directory[tag] = value
+    directory.save(content)
+    path.write_bytes(content.getvalue() + b"".join(strips))
+
+
+@pytest.mark.parametrize(
+    ("kind", "layout"), [("uint16", {}), ("uint8", {"planar": 2}), ("uint8", {"negative": True})]
+)
+def test_a_tiff_of_every_layout_has_its_colors(tmp_path, kind, layout):
+    channels = 1 if "negative" in layout else 3
+    pixels = np.random.default_rng(0).integers(0, 256, (6, 10, channels), np.uint8)
+    stored = (255 - pixels if "negative" in layout else pixels).astype(kind)
+    write_tiff(tmp_path / "a.tif", stored * (257 if kind == "uint16" else 1), **layout)
+    with open_picture(tmp_path / "a.tif") as image:
+        assert (np.asarray(image.convert("RGB")) == pixels).all()
+
+
+@pytest.mark.parametrize(
+    ("layout", "channels", "told"),
+    [
+        ({"planar": 2}, 3, "16 bits are stored by channel"),  # Pillow mixes rows and colors
+        ({"negative": True}, 1, "or as a negative"),  # Pillow leaves white black
+        ({"kind": 1}, 3, "its first picture is a thumbnail"),  # as scanners and cameras put it first
+    ],
+)
+def test_a_tiff_that_would_be_read_wrongly_is_left_out_with_the_reason(tmp_path, layout, channels, told):
+    pixels = np.random.default_rng(0).integers(0, 65536, (24, 40, channels), np.uint16)
+    write_tiff(tmp_path / "a.tif", pixels, **layout)
+    _, bad = readable(find_photos(tmp_path))
+    assert told in bad["a.tif"] and "JPEG or PNG" in bad["a.tif"]
 
 
 def test_a_png_with_megabytes_of_text_is_read(tmp_path):
