@@ -76,8 +76,8 @@ def _left_handed(axes: bytes | None) -> bool:
 def _mirrored(splats: Splats) -> Splats:
     """Mirror splats in x, which is told."""
     say("its axes are left-handed, so x is mirrored: elsewhere it has the other sign")
-    harmonics = splats.harmonics.clone()
-    harmonics[:, [band for band in _ODD if band < harmonics.shape[1]]] *= -1
+    bands = range(splats.harmonics.shape[1])
+    harmonics = splats.harmonics * splats.means.new_tensor([[-1.0 if i in _ODD else 1.0] for i in bands])
     means, quats = (part * part.new_tensor(signs) for part, signs in (
         (splats.means, [-1.0, 1, 1]), (splats.quats, [1.0, 1, -1, -1])
     ))  # fmt: skip

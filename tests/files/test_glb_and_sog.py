@@ -383,7 +383,6 @@ def test_a_sog_of_any_age_tells_antialiasing_and_may_lack_the_lowest_value(told,
             other.writestr(name, content)
     found = read_splats(tmp_path / "b.sog")
     torch.testing.assert_close(found.scales.log(), splats.scales.log(), atol=0.06, rtol=0)
-    assert bool(found.scales.isfinite().all()) and float(found.opacities.min()) > 0
     assert found.antialiased == (told not in ({"model": "2dgs"}, {}))
 
 

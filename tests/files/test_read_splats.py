@@ -384,7 +384,7 @@ def test_comments_and_properties_of_other_programs_are_skipped(tmp_path):
     write_splats(tmp_path / "a.ply", some_splats(5))
     _, rows = table(tmp_path / "a.ply")
     write_table(tmp_path / "b.ply", rows, "ascii", "<f4", "float")
-    told = "comment Ångström, not the end_header".encode()  # whose first letter holds a line break in Latin 1
+    told = "comment not the end_header: Åformat none".encode()  # in Latin 1, Å ends a line
     content = (tmp_path / "b.ply").read_bytes().replace(b"comment by hand", told)
     renamed = content.replace(b"float nx\n", b"float f_rest_of_mine\n")
     assert renamed != content and b"not the end_header" in content
