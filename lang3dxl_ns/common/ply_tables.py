@@ -52,7 +52,7 @@ def read_header(file: BinaryIO) -> tuple[str, dict[str, Table], list[str]]:
     if end is None:
         raise ValueError("its header doesn't end")
     form, order, tables, table = "", "<", dict[str, Table](), Table(0)
-    lines = head[: end.start()].decode("latin-1").splitlines()
+    lines = head[: end.start()].decode("latin-1").split("\n")  # comments may hold other line breaks
     for line in lines:
         match line.split():
             case ["format", form, *_]:

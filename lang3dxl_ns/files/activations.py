@@ -48,6 +48,11 @@ def activated(
     return Splats(means, quats, log_scales.exp(), opacities, harmonics, antialiased)
 
 
+def flat(scales: Float[Tensor, "n 2"]) -> Float[Tensor, "n 3"]:
+    """Return the logarithms of the scales of flat Gaussians (2D Gaussian splatting), which have two."""
+    return torch.cat([scales, scales.amin(1, keepdim=True) - 5], dim=1)
+
+
 def logits(splats: Splats) -> Float[Tensor, " n"]:
     """Compute the logits of the opacities."""
     return splats.opacities.clamp(LEAST_OPACITY, 1 - LEAST_OPACITY).logit()

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from lang3dxl_ns.common.checks import expect
 from lang3dxl_ns.common.errors import UserError
-from lang3dxl_ns.files.activations import ALL_BANDS, activated, check_memory
+from lang3dxl_ns.files.activations import ALL_BANDS, activated, check_memory, flat
 from lang3dxl_ns.rendering import Splats, harmonics_of
 
 
@@ -60,10 +60,11 @@ def _gsplat(parts: Mapping[str, Any], path: Path) -> Splats:
     if "sh0" not in parts:
         raise UserError("a network makes its colors (app_opt): train it without, or export a PLY")
     harmonics = torch.cat([parts[name] for name in ("sh0", "shN") if name in parts], dim=1)
-    antialiased = _configured(path.parent.parent / "cfg.yml", "antialiased: true")
-    return activated(
-        parts["means"], parts["scales"], parts["quats"], parts["opacities"], harmonics, antialiased
-    )
+    run, scales = path.parent.parent, parts["scales"]
+    if _configured(run / "cfg.json", '"model_type": "2dgs'):  # nothing was drawn with the third
+        scales = flat(scales[:, :2])
+    antialiased = _configured(run / "cfg.yml", "antialiased: true")
+    return activated(parts["means"], scales, parts["quats"], parts["opacities"], harmonics, antialiased)
 
 
 def _splatfacto(pipeline: Mapping[str, Any], path: Path) -> Splats:

@@ -211,6 +211,8 @@ def read_glb(path: Path) -> Splats:
         say(f"{path} holds {len(splats)} splats, of which the first is read: join them in a splat editor")
     found = splats[0]
     named = found["attributes"]
+    if str(found["extensions"][_SPLATS].get("colorSpace")).startswith("lin"):
+        say(f"{path} has linear colors, which are shown too dark: convert them to srgb_rec709_display")
     for name, about in (found["extensions"][_SPLATS].get("extensions") or {}).items():
         if not name.startswith(_SPZ):
             raise UserError(f"its splats are compressed by {name}: export them without compression")

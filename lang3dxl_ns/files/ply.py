@@ -18,13 +18,23 @@ from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.pictures import color_bytes
 from lang3dxl_ns.common.ply_tables import Table, read_header, read_vertices
-from lang3dxl_ns.files.activations import ALL_BANDS, activated, array_of, check_memory, log_scales, logits
+from lang3dxl_ns.files.activations import (
+    ALL_BANDS,
+    activated,
+    array_of,
+    check_memory,
+    flat,
+    log_scales,
+    logits,
+)
 from lang3dxl_ns.rendering import Splats, harmonics_of
 
 _NEEDED = ("x", "y", "z", "opacity", "scale_0", "scale_1", "rot_0", "rot_1", "rot_2", "rot_3")
 _COLORS, _HARMONICS = ("red", "green", "blue"), ("f_dc_0", "f_dc_1", "f_dc_2")
 _ANTIALIASED = re.compile(r"comment\s+(splatrendermode:\s*mip|antialiased:?\s*(1|true))\s*", re.IGNORECASE)
 """Comments by which programs tell that a splat was trained with antialiasing."""
+_BY_CHANCE = 6
+"""Gaussians up to which logits may all lie between 0 and 1."""
 
 
 def read_ply(path: Path) -> Splats:
@@ -34,8 +44,9 @@ def read_ply(path: Path) -> Splats:
         form, tables, lines = read_header(file)
         vertices = tables.get("vertex", Table(0))
         names = [name for name, _ in vertices.columns]
+        antialiased = any(map(_ANTIALIASED.fullmatch, lines))
         if "chunk" in tables and "packed_position" in names:
-            return _supersplat(path, tables)
+            return replace(_supersplat(path, tables), antialiased=antialiased)
         # CloudCompare names all columns but the coordinates so.
         known = {name.lower().removeprefix("scalar_"): name for name in names}
         colors = _COLORS if _COLORS[0] in known else _HARMONICS
@@ -44,7 +55,7 @@ def read_ply(path: Path) -> Splats:
         check_memory(vertices.length, 1 + sum(name.startswith("f_rest_") for name in known) // 3)
         columns = read_vertices(file, form, tables)
         splats = _splats_of({plain: columns[name] for plain, name in known.items() if name in columns})
-        return replace(splats, antialiased=any(map(_ANTIALIASED.fullmatch, lines)))
+        return replace(splats, antialiased=antialiased)
 
 
 def _splats_of(table: Any) -> Splats:
@@ -65,16 +76,33 @@ def _splats_of(table: Any) -> Splats:
         raise UserError(f"it has {len(rest)} columns f_rest, not 9, 24, 45 or 72: export it anew")
     # Coefficients are stored channel by channel.
     others = columns(*rest).reshape(len(first), 3, len(rest) // 3).mT if rest else first[:, :0]
-    scales = columns("scale_0", "scale_1")
-    # A flat Gaussian (2D Gaussian splatting) has only two scales.
-    third = columns("scale_2") if "scale_2" in table else scales.amin(1, keepdim=True) - 5
-    quats, opacities = columns("rot_0", "rot_1", "rot_2", "rot_3"), columns("opacity")
-    # Never of logarithms and logits: all larger than a unit, and none fainter than a half.
-    if len(first) > 1 and bool((scales > 0).all() and ((opacities >= 0) & (opacities <= 1)).all()):
+    scales = columns(*(name for name in ("scale_0", "scale_1", "scale_2") if name in table))
+    scales, opacities = _stored(scales, columns("opacity"))
+    if scales.shape[1] == 2:
+        scales = flat(scales)
+    quats, harmonics = columns("rot_0", "rot_1", "rot_2", "rot_3"), torch.cat([first, others], dim=1)
+    splats = activated(columns("x", "y", "z"), scales, quats, opacities, harmonics)
+    if "filter_3d" in table:  # Mip-Splatting draws each Gaussian blurred by this, and as much fainter
+        wide = (splats.scales.square() + columns("filter_3d").square()).sqrt().clamp_min(1e-30)
+        fainter = splats.opacities * (splats.scales / wide).prod(1)
+        splats = replace(splats, scales=wide, opacities=fainter)
+    return splats
+
+
+def _stored(
+    scales: Float[Tensor, "n k"], opacities: Float[Tensor, "n 1"]
+) -> tuple[Float[Tensor, "n k"], Float[Tensor, "n 1"]]:
+    """Return scales as logarithms and opacities as logits, as which most programs store them; say if they are
+    stored as they are."""
+    # Logits are never all between 0 and 1 (opacities of .5 to .73), so that logarithms above 0 are none then.
+    within = bool(((opacities >= 0) & (opacities <= 1)).all() and opacities.any())
+    if len(opacities) <= _BY_CHANCE or not within:
+        return scales, opacities
+    if bool((scales[:, :2] > 0).all()):
         say("its sizes and opacities are not logarithms and logits, and are taken as they are")
-        scales, third, opacities = scales.log(), third.clamp_min(1e-9).log(), opacities.logit()
-    scales, harmonics = torch.cat([scales, third], dim=1), torch.cat([first, others], dim=1)
-    return activated(columns("x", "y", "z"), scales, quats, opacities, harmonics)
+        return scales.clamp_min(1e-9).log(), opacities.logit()
+    say("its opacities are not logits, and are taken as they are")
+    return scales, opacities.logit()
 
 
 def _supersplat(path: Path, tables: dict[str, Table]) -> Splats:

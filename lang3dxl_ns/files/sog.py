@@ -52,6 +52,7 @@ def encode_sog(splats: Splats) -> bytes:
         "version": 2,
         "count": len(splats),
         "antialias": splats.antialiased,
+        **({"model": "antialiased"} if splats.antialiased else {}),
         "means": {"mins": low.tolist(), "maxs": high.tolist(), "files": ["means_l.webp", "means_u.webp"]},
         "scales": {"codebook": scale_book, "files": ["scales.webp"]},
         "quats": {"files": ["quats.webp"]},
@@ -120,7 +121,7 @@ def read_sog(path: Path) -> Splats:
         tensor_of(_book(about["scales"])[scales[:, :3]]).exp(),
         torch.from_numpy(first[:, 3] / np.float32(255)),
         tensor_of(harmonics[:, :ALL_BANDS]),
-        bool(about.get("antialias", False)),
+        bool(about.get("antialias", False)) or about.get("model") == "antialiased",
     )
 
 
@@ -128,7 +129,7 @@ def _palette(bundle: zipfile.ZipFile, about: dict[str, Any], count: int) -> Floa
     """Read the harmonics above degree 0, which Gaussians share."""
     bands = (about["bands"] + 1) ** 2 - 1
     expect(bands in (3, 8, 15), f"its harmonics have {about['bands']} bands")
-    with Image.open(io.BytesIO(_member(bundle, about["files"][0]))) as image:
+    with _opened(bundle, about["files"][0]) as image:
         expect(image.width == _COLUMNS * bands, "its palette has another width")
         colors = np.asarray(image.convert("RGB")).reshape(-1, bands, 3)
     labels = _pixels(bundle, about["files"][1], count).astype(np.int64)
@@ -140,6 +141,7 @@ def _palette(bundle: zipfile.ZipFile, about: dict[str, Any], count: int) -> Floa
 def _book(about: dict[str, Any]) -> Float32[Array, "256"]:
     book = np.array(about["codebook"], np.float32)
     expect(book.shape == (256,), "a codebook has not 256 values")
+    book[0] = book[1] if np.isnan(book[0]) else book[0]  # PlayCanvas' tools write null for what is lowest
     return book
 
 
@@ -154,9 +156,14 @@ def _unpacked(quats: UInt8[Array, "n 4"]) -> Float32[Array, "n 4"]:
 
 
 def _pixels(bundle: zipfile.ZipFile, name: str, count: int) -> UInt8[Array, "n 4"]:
-    with Image.open(io.BytesIO(_member(bundle, name))) as image:
+    with _opened(bundle, name) as image:
         expect(count <= image.width * image.height <= 4 * count + 4096, f"{name} has another size")
         return np.asarray(image.convert("RGBA")).reshape(-1, 4)[:count]
+
+
+def _opened(bundle: zipfile.ZipFile, name: str) -> Image.Image:
+    # No other decoder, and no program that one starts (Ghostscript), sees a stranger's file.
+    return Image.open(io.BytesIO(_member(bundle, name)), formats=("WEBP", "PNG"))
 
 
 def _member(bundle: zipfile.ZipFile, name: str) -> bytes:

@@ -39,9 +39,10 @@ def write_splats(
     """Write a .ply, .spz, .sog or .glb file, without Gaussians that have a NaN or infinite value, and return
     the number of those written. relevancy: each Gaussian's to a prompt, 0…1, written to a PLY as the property
     `relevancy`. place: meters, up and north, for a .glb's node and a comment of a PLY. Raises UserError if
-    the ending names another kind of file, or .spz cannot hold such coordinates."""
+    no Gaussian is left, the ending names another kind of file, or .spz cannot hold such coordinates."""
     check_splat_name(path)
-    sound = splats.sound()
+    if not len(splats) or not bool((sound := splats.sound()).any()):
+        raise UserError(f"no Gaussian is left for {path.name}: write it without --hide-floaters")
     splats, relevancy = splats.select(sound), None if relevancy is None else relevancy[sound]
     write_atomically(path, _WRITERS[path.suffix.lower()](splats, relevancy, place))
     return len(splats)

@@ -9,7 +9,8 @@ from __future__ import annotations
 import gzip
 import struct
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
+from dataclasses import replace
 from io import BufferedIOBase, BytesIO
 from math import exp, floor, log2
 from pathlib import Path
@@ -33,6 +34,10 @@ _ANTIALIASED, _RECORDS = 1, 2
 """Bits of the flags."""
 _RECORD, _SCENE = struct.Struct("<II"), 0x4C330001
 """Type and length of a record, and the type of ours: vendor "L3", record 1."""
+_AXES = 0xADBE0003
+"""Type of the record that names the directions of the axes."""
+_ODD = [3, 4, 7, 10, 13, 15]
+"""Harmonics that change their sign with x."""
 _HIGHEST_DEGREE = 4
 
 
@@ -57,23 +62,50 @@ def decode_spz(file: BinaryIO) -> Splats:
             expect(bool(flags & _RECORDS) or not stream.read(1), _MORE)
         else:
             parts = _zstd_parts(stream.read(), [count * side for side in sides if side], streams)
-        return _decoded(parts, count, version, bits, flags)
+        splats = _decoded(parts, count, version, bits, flags)
+    return _mirrored(splats) if _left_handed(_record(file, _AXES)) else splats
+
+
+def _left_handed(axes: bytes | None) -> bool:
+    """Return whether a record names left-handed axes. Its number, less one, has a bit each for right (not
+    left), up (not down) and forward (not back), and one for axes in the order x, z, y."""
+    number = int.from_bytes(axes or b"", "little") - 1
+    return 0 <= number < 16 and number.bit_count() % 2 == 1
+
+
+def _mirrored(splats: Splats) -> Splats:
+    """Mirror splats in x, which is told."""
+    say("its axes are left-handed, so x is mirrored: elsewhere it has the other sign")
+    bands = range(splats.harmonics.shape[1])
+    harmonics = splats.harmonics * splats.means.new_tensor([[-1.0 if i in _ODD else 1.0] for i in bands])
+    means, quats = (part * part.new_tensor(signs) for part, signs in (
+        (splats.means, [-1.0, 1, 1]), (splats.quats, [1.0, 1, -1, -1])
+    ))  # fmt: skip
+    return replace(splats, means=means, quats=quats, harmonics=harmonics)
 
 
 def scene_record(path: Path) -> bytes | None:
     """Read the scene file in a file; None if there is none. Raises what `read_spz` does."""
-    with path.open("rb") as file, _opened(file) as (stream, version, count, degree, _, flags, _):
+    with path.open("rb") as file:
+        return _record(file, _SCENE)
+
+
+def _record(file: BinaryIO, wanted: int) -> bytes | None:
+    """Read the first record of a type; None if there is none."""
+    largest = 100 * file.seek(0, 2)  # nothing that a scene holds packs so well
+    with _opened(file) as (stream, version, count, degree, _, flags, _):
+        if not flags & _RECORDS:
+            return None
         if version < 4:  # records end the stream; in version 4 they follow the header of 32 bytes
             stream.seek(_HEADER.size + count * sum(_sides(version, degree)))
         else:
             start = struct.unpack("<I", _exactly(stream, 4))[0]
             stream = BytesIO(stream.read()[12 : max(start - 20, 12)])
-        largest = 100 * path.stat().st_size  # nothing that a scene holds packs so well
-        while flags & _RECORDS and len(head := stream.read(_RECORD.size)) == _RECORD.size:
+        while len(head := stream.read(_RECORD.size)) == _RECORD.size:
             kind, size = _RECORD.unpack(head)
             expect(size <= largest, _MORE)
             content = _exactly(stream, size)
-            if kind == _SCENE:
+            if kind == wanted:
                 return content
     return None
 
@@ -81,9 +113,10 @@ def scene_record(path: Path) -> bytes | None:
 @contextmanager
 def _opened(file: BinaryIO) -> Iterator[tuple[Any, ...]]:
     """Open a file of any version: its unpacked stream after the header, and the header's numbers."""
+    file.seek(0)
     packed = file.read(2) == b"\x1f\x8b"
     file.seek(0)
-    with gzip.open(file) if packed else file as stream:
+    with gzip.open(file) if packed else nullcontext(file) as stream:
         head = stream.read(_HEADER.size)
         expect(len(head) == _HEADER.size, "its header is cut short")
         magic, version, *numbers = _HEADER.unpack(head)

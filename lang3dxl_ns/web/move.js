@@ -9,6 +9,12 @@ const LOOK = 0.003, WHEEL = 0.001, STEEPEST = 1.5; // radians per pixel, seconds
 const WAYS = { w: [0, 0, 1], s: [0, 0, -1], a: [-1, 0, 0], d: [1, 0, 0], q: [0, -1, 0], e: [0, 1, 0] }; // right, up, ahead
 export const still = matchMedia("(prefers-reduced-motion: reduce)");
 
+/** Name a key: letters in lower case, and those of other scripts by their place. Some events of browsers have no key. */
+export function keyName({ key = "", code }) {
+  const letter = key.length === 1 && !/[ -~]/.test(key) ? /^Key([A-Z])$/.exec(code)?.[1] : null;
+  return key.length === 1 ? (letter ?? key).toLowerCase() : key;
+}
+
 /** Read a viewpoint's text, the opposite of `Mover.address`; null if it is none. */
 function standOf(text) {
   const numbers = text.split(",").map(Number);
@@ -221,8 +227,8 @@ export class Mover extends EventTarget {
   }
 
   /** Steer by a key; returns whether it has a meaning. */
-  steer({ key, repeat }) {
-    const name = key.length === 1 ? key.toLowerCase() : key, way = WAYS[name];
+  steer(event) {
+    const name = keyName(event), { repeat } = event, way = WAYS[name];
     const turn = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] }[name];
     const zoom = { "+": 1, "=": 1, "-": -1 }[name];
     if (name === "Home") this.overview();
@@ -276,7 +282,7 @@ export class Mover extends EventTarget {
       if (event.ctrlKey || event.metaKey || event.altKey || event.target.matches("input")) return; // a shortcut of the browser
       if (this.steer(event)) event.preventDefault();
     });
-    addEventListener("keyup", ({ key }) => this.held.delete(key.length === 1 ? key.toLowerCase() : key));
+    addEventListener("keyup", (event) => this.held.delete(keyName(event)));
     addEventListener("blur", () => this.held.clear());
     frame.addEventListener("focusout", () => this.held.clear());
   }

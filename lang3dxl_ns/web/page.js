@@ -6,6 +6,7 @@ import { Kept, readFields, Steps, written, MOST_PROMPTS } from "./history.js";
 import { unpacked } from "./library.js";
 import { List } from "./list.js";
 import { distanceAsText, drawScale, heightAsText, inShares, setLength } from "./measure.js";
+import { keyName } from "./move.js";
 import { Photos } from "./photos.js";
 import { areExamples, asPython, drawOutline, examplesAsText, examplesFromText, inside, rounded, UNNAMED, wordsFile } from "./teach.js";
 import { fetched, request, thinker } from "./think.js";
@@ -524,15 +525,15 @@ function listen() {
 
 /** Answer a key that means the same everywhere on the page. */
 function press(event) {
-  const typing = event.target.matches("input:not([type=range], [type=checkbox]), select"), { key } = event, command = event.ctrlKey || event.metaKey;
+  const typing = event.target.matches("input:not([type=range], [type=checkbox]), select"), key = keyName(event), command = event.ctrlKey || event.metaKey;
   if (key === "Escape") {
     if (typing) event.preventDefault(); // or it would empty the search box
     return typing ? event.target.blur() : close();
   }
   if (typing || event.altKey) return;
-  const again = key.toLowerCase() === "y" || event.shiftKey, onPicture = event.target === $("frame") || event.target === document.body;
+  const again = key === "y" || event.shiftKey, onPicture = event.target === $("frame") || event.target === document.body;
   const act = command
-    ? { z: () => (again ? steps.redo() : steps.undo()), y: () => steps.redo() }[key.toLowerCase()]
+    ? { z: () => (again ? steps.redo() : steps.undo()), y: () => steps.redo() }[key]
     : { "/": () => (fold(false), $("word").focus()), ",": () => photos.step(-1), ".": () => photos.step(1), "[": () => list.step(-1), "]": () => list.step(1), ...(onPicture && { Enter: () => tell(middle()), f: () => focusOn(middle()) }) }[key];
   if (!act) return;
   event.preventDefault();

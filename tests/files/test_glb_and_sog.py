@@ -143,6 +143,14 @@ def test_a_glb_with_several_splats_tells_that_one_is_read(tmp_path, capsys):
     assert "holds 2 splats, of which the first is read" in capsys.readouterr().out
 
 
+def test_a_glb_of_linear_colors_is_told(tmp_path, capsys):
+    write_splats(tmp_path / "a.glb", some_splats())
+    space = {"colorSpace": "lin_rec709_display"}
+    changed(tmp_path / "a.glb", lambda _, ps, __: ps[0]["extensions"]["KHR_gaussian_splatting"].update(space))
+    assert len(read_splats(tmp_path / "a.glb")) == 200
+    assert "has linear colors, which are shown too dark" in capsys.readouterr().out
+
+
 def test_a_glb_may_name_the_stride_of_rows_without_gaps(tmp_path):
     def stride(size):
         return lambda about, primitives, _: about["bufferViews"][
@@ -360,6 +368,41 @@ def test_the_palette_of_a_sog_is_read(tmp_path):
             bundle.writestr(name, content)
     found = read_splats(tmp_path / "b.sog")
     np.testing.assert_allclose(found.harmonics[2, 1:], book[palette[63]], atol=1e-6)
+
+
+@pytest.mark.parametrize("told", [{"antialias": True}, {"model": "antialiased"}, {"model": "2dgs"}, {}])
+def test_a_sog_of_any_age_tells_antialiasing_and_may_lack_the_lowest_value(told, tmp_path):
+    splats = some_splats(400, bands=1)
+    write_splats(tmp_path / "a.sog", splats)
+    with zipfile.ZipFile(tmp_path / "a.sog") as ours, zipfile.ZipFile(tmp_path / "b.sog", "w") as other:
+        meta = json.loads(ours.read("meta.json"))
+        assert meta.pop("antialias") and meta.pop("model") == "antialiased"
+        meta["scales"]["codebook"][0] = None
+        for name in ours.namelist():
+            content = json.dumps(meta | told) if name == "meta.json" else ours.read(name)
+            other.writestr(name, content)
+    found = read_splats(tmp_path / "b.sog")
+    torch.testing.assert_close(found.scales.log(), splats.scales.log(), atol=0.06, rtol=0)
+    assert found.antialiased == (told not in ({"model": "2dgs"}, {}))
+
+
+@pytest.mark.parametrize(("form", "known"), [("PNG", True), ("TIFF", False), ("EPS", False)])
+def test_pictures_of_a_sog_are_webp_or_png_whatever_their_names(form, known, tmp_path):
+    """A decoder of others would start Ghostscript."""
+    splats = some_splats(100, bands=1)
+    write_splats(tmp_path / "a.sog", splats)
+    with zipfile.ZipFile(tmp_path / "a.sog") as ours, zipfile.ZipFile(tmp_path / "b.sog", "w") as other:
+        for name in ours.namelist():
+            content, written = ours.read(name), io.BytesIO()
+            if name == "means_l.webp":  # which has no transparency
+                Image.open(io.BytesIO(content)).convert("RGB").save(written, form)
+            other.writestr(name, written.getvalue() or content)
+    if known:
+        ours, other = (read_splats(tmp_path / f"{name}.sog").means for name in "ab")
+        torch.testing.assert_close(ours, other)
+    else:
+        with pytest.raises(UserError, match=r"b\.sog is damaged or incomplete \(cannot identify"):
+            read_splats(tmp_path / "b.sog")
 
 
 @pytest.mark.parametrize(

@@ -75,6 +75,17 @@ def test_a_checkpoint_of_several_gpus_is_read_whole_without_copies_of_its_files(
         assert "lies in 2 files" in capsys.readouterr().out
 
 
+def test_a_checkpoint_of_gsplats_2dgs_is_flat(tmp_path):
+    """It keeps a third scale, with which nothing was drawn."""
+    splats = some_splats()
+    (tmp_path / "ckpts").mkdir()
+    torch.save(gsplat_state(splats), tmp_path / "ckpts" / "ckpt_29999.pt")
+    (tmp_path / "cfg.json").write_text('{"data_factor": 4, "model_type": "2dgs"}')
+    found = read_splats(tmp_path)
+    torch.testing.assert_close(found.scales[:, :2], splats.scales[:, :2])
+    assert bool((found.scales[:, 2] < 0.01 * found.scales[:, :2].amin(1)).all())
+
+
 def test_older_names_in_checkpoints_are_read(tmp_path):
     splats, config = some_splats(), tmp_path / "cfg.yml"
     state = gsplat_state(splats)

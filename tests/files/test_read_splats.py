@@ -17,6 +17,7 @@ from lang3dxl_ns.files.activations import log_scales, logits
 from lang3dxl_ns.files.read_splats import find_splats, read_splats
 from lang3dxl_ns.files.splat_file import write_splats
 from lang3dxl_ns.rendering import Splats
+from lang3dxl_ns.rendering.projection import rotations
 
 
 def table(path) -> tuple[list[str], np.ndarray]:
@@ -54,6 +55,34 @@ def test_sizes_and_opacities_that_are_no_logarithms_and_logits_are_read_as_they_
         read_splats(tmp_path / "c.ply")
 
 
+@pytest.mark.parametrize("same", [False, True])
+def test_opacities_that_are_no_logits_are_read_as_they_are_beside_logarithms(same, tmp_path, capsys):
+    """As networks that make a splat of a few photos, and converters of meshes, write them."""
+    splats = some_splats(30)
+    splats.opacities[:] = 1.0 if same else splats.opacities
+    write_splats(tmp_path / "a.ply", splats)
+    rows = table(tmp_path / "a.ply")[1].copy()
+    rows["opacity"] = splats.opacities
+    write_table(tmp_path / "b.ply", rows, "binary_little_endian", "<f4", "float")
+    assert_alike(read_splats(tmp_path / "b.ply"), splats)
+    assert "its opacities are not logits, and are taken as they are" in capsys.readouterr().out
+    write_table(tmp_path / "few.ply", rows[:6], "binary_little_endian", "<f4", "float")  # may be by chance
+    torch.testing.assert_close(read_splats(tmp_path / "few.ply").opacities, splats.opacities[:6].sigmoid())
+
+
+def test_a_mip_splatting_is_as_wide_and_as_faint_as_it_was_drawn(tmp_path):
+    """Its Gaussians, convolved with a filter of their own size, keep their mass in every direction."""
+    splats, width = some_splats(20), torch.linspace(0, 0.5, 20)
+    write_splats(tmp_path / "a.ply", splats)
+    rows = recfunctions.append_fields(table(tmp_path / "a.ply")[1], "filter_3D", width.numpy(), usemask=False)
+    write_table(tmp_path / "b.ply", rows, "binary_little_endian", "<f4", "float")
+    found = read_splats(tmp_path / "b.ply")
+    torch.testing.assert_close(found.scales**2, splats.scales**2 + width[:, None] ** 2)
+    mass = [one.opacities * one.scales.prod(1) for one in (found, splats)]
+    torch.testing.assert_close(*mass)
+    torch.testing.assert_close(found.opacities[0], splats.opacities[0])
+
+
 def test_every_property_of_a_ply_is_in_its_place(tmp_path):
     splats, relevancy = some_splats(7), torch.linspace(0, 1, 7)
     splats.scales[2, 1] = torch.nan  # broken Gaussians stay out
@@ -73,6 +102,16 @@ def test_every_property_of_a_ply_is_in_its_place(tmp_path):
         np.testing.assert_array_equal(rows[f"f_rest_{3 * channel}"], splats.harmonics[:, 1, channel])
     with pytest.raises(UserError, match=r"use .ply, .spz, .sog or .glb"):
         write_splats(tmp_path / "all.obj", splats)
+
+
+@pytest.mark.parametrize("ending", ["ply", "spz", "sog", "glb"])
+def test_a_file_without_a_gaussian_is_not_written(ending, tmp_path):
+    splats = some_splats(5)
+    broken = replace(splats, means=torch.full_like(splats.means, torch.nan))
+    for none in (splats.select(torch.zeros(5, dtype=torch.bool)), broken):
+        with pytest.raises(UserError, match=rf"no Gaussian is left for a\.{ending}.*--hide-floaters"):
+            write_splats(tmp_path / f"a.{ending}", none)
+    assert [*tmp_path.iterdir()] == []
 
 
 @pytest.mark.parametrize("bands", [1, 4, 9, 16])
@@ -166,8 +205,11 @@ def test_supersplats_compressed_ply_is_read(tmp_path):
     order = [torch.cdist(found.means, splats.means).argmin(1)]
     wanted = splats.select(order[0])
     assert_alike(found, wanted, means=5e-3, scales=5e-3, opacities=5e-3, colors=0.03, turn=1e-4)
-    # Older versions stored no bounds of the colors.
     content = (tmp_path / "a.compressed.ply").read_bytes()
+    tagged = content.replace(b"element chunk", b"comment SplatRenderMode: mip\nelement chunk", 1)
+    (tmp_path / "c.compressed.ply").write_bytes(tagged)
+    assert read_splats(tmp_path / "c.compressed.ply").antialiased and not found.antialiased
+    # Older versions stored no bounds of the colors.
     (tmp_path / "b.compressed.ply").write_bytes(content.replace(b"float min_r\n", b"float other\n"))
     with pytest.raises(UserError, match=r"b\.compressed\.ply: an older SuperSplat wrote it: open it"):
         read_splats(tmp_path / "b.compressed.ply")
@@ -342,7 +384,8 @@ def test_comments_and_properties_of_other_programs_are_skipped(tmp_path):
     write_splats(tmp_path / "a.ply", some_splats(5))
     _, rows = table(tmp_path / "a.ply")
     write_table(tmp_path / "b.ply", rows, "ascii", "<f4", "float")
-    content = (tmp_path / "b.ply").read_bytes().replace(b"comment by hand", b"comment not the end_header")
+    told = "comment not the end_header: Åformat none".encode()  # in Latin 1, Å ends a line
+    content = (tmp_path / "b.ply").read_bytes().replace(b"comment by hand", told)
     renamed = content.replace(b"float nx\n", b"float f_rest_of_mine\n")
     assert renamed != content and b"not the end_header" in content
     for path, written in (("c.ply", content), ("d.ply", renamed)):
@@ -421,6 +464,29 @@ def test_spz_of_every_version_and_degree_is_read(version, degree, tmp_path):
         with_colors(found, found.colors(torch.zeros(3))), with_colors(splats, splats.colors(torch.zeros(3))),
         means=4e-3, scales=0.04, opacities=5e-3, colors=0.02, turn=1e-4,
     )  # fmt: skip
+
+
+def test_an_spz_that_tells_left_handed_axes_is_not_mirrored(tmp_path, capsys):
+    """Directions of x, y, z: right or left, up or down, back or front."""
+    splats = some_splats(bands=16)
+    write_splats(tmp_path / "a.spz", splats)
+    plain = gzip.decompress((tmp_path / "a.spz").read_bytes())
+    kept, place = read_splats(tmp_path / "a.spz"), torch.tensor([0.3, -5.0, 1.0])
+    names = [f"{x}{y}{z}" for z in "BF" for y in "DU" for x in "LR"]
+    names += [f"{x}{z}{y}" for z in "BF" for y in "DU" for x in "LR"]
+    for number, axes in enumerate(names, start=1):
+        record = struct.pack("<III", 0xADBE0003, 4, number)
+        (tmp_path / "b.spz").write_bytes(gzip.compress(plain[:14] + b"\2" + plain[15:] + record))
+        found = read_splats(tmp_path / "b.spz")
+        rows = {"R": (0, 1), "L": (0, -1), "U": (1, 1), "D": (1, -1), "B": (2, 1), "F": (2, -1)}
+        flip = round(np.linalg.det([np.eye(3)[row] * sign for row, sign in (rows[one] for one in axes)]))
+        mirror = torch.tensor([flip, 1, 1], dtype=torch.float32)
+        torch.testing.assert_close(found.means, kept.means * mirror)
+        torch.testing.assert_close(found.colors(place * mirror), kept.colors(place))
+        whole, other = (rotations(one.quats) @ torch.diag_embed(one.scales**2) for one in (found, kept))
+        whole, other = whole @ rotations(found.quats).mT, other @ rotations(kept.quats).mT
+        torch.testing.assert_close(whole, mirror[:, None] * other * mirror)
+        assert ("left-handed" in capsys.readouterr().out) == (flip < 0)
 
 
 def test_our_spz_is_what_gsply_reads(tmp_path):

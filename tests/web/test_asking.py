@@ -275,6 +275,19 @@ def test_without_webgl_it_says_what_helps(browser, address):
 
 
 @pytest.mark.slow
+def test_a_script_that_cant_run_is_told(browser, address):
+    """As by servers on Windows, whose registry may call .js files text, and in browsers that are too old."""
+    lost, text, odd = {"status": 404}, {"content_type": "text/plain"}, {"body": "let = ="}
+    for script, answer in (("page", lost), ("page", odd), ("history", lost), ("history", text)):
+        page = browser.new_page()
+        told = {"body": "export {}", "content_type": "text/javascript"} | answer
+        page.route(f"**/{script}.js", lambda route, told=told: route.fulfill(**told))
+        page.goto(address)
+        until_told(page, "#status", "The page's scripts can't run")
+        page.close()
+
+
+@pytest.mark.slow
 def test_a_scene_without_words_cant_be_typed_to(browser, tmp_path):
     write_page(Page(painted_scene(decoder=None, codes=None)), tmp_path)
     with served(tmp_path) as address:

@@ -183,6 +183,22 @@ def test_shortcuts_of_the_browser_do_not_steer(page):
 
 
 @pytest.mark.slow
+def test_letters_that_a_keyboard_lacks_are_found_by_their_place(page):
+    """On a Cyrillic one, for example. On a Latin one, such as AZERTY, what is written on a key counts."""
+    held = "[...lang3dxl.view.mover.held.keys()].join()"
+    for key, code, meant in (("ц", "KeyW", "w"), ("Ц", "KeyW", "w"), ("w", "KeyZ", "w"), ("z", "KeyW", "")):
+        page.evaluate(f"{PRESS}('{key}', {{ code: '{code}' }})")
+        assert page.evaluate(held) == meant
+        page.evaluate(f"dispatchEvent(new KeyboardEvent('keyup', {{ key: '{key}', code: '{code}' }}))")
+        assert page.evaluate(held) == ""
+    page.evaluate("dispatchEvent(new Event('keyup'))")  # as Chrome sends when a suggestion is chosen
+    page.evaluate("lang3dxl.ask('dome')")
+    until(page, "lang3dxl.prompts.length", 1)
+    page.evaluate(f"{PRESS}('я', {{ code: 'KeyZ', ctrlKey: true }})")
+    until(page, "lang3dxl.prompts.length", 0)
+
+
+@pytest.mark.slow
 def test_a_lost_picture_comes_back(page):
     page.evaluate("lang3dxl.ask('dome')")
     before = picture(page)
