@@ -21,7 +21,7 @@ from typing import Annotated, Any
 import tyro
 
 from lang3dxl_ns.common.checks import disk_trouble
-from lang3dxl_ns.common.console import accept_any_console, silence_libraries
+from lang3dxl_ns.common.console import accept_any_console, keep_standard_numbers, silence_libraries
 from lang3dxl_ns.common.errors import NO_NERFSTUDIO, UserError, misses_nerfstudio
 from lang3dxl_ns.common.files import expanded
 from lang3dxl_ns.common.memory import ran_out_of_memory
@@ -71,6 +71,7 @@ Commands of `lab` are available only in a checkout."""
 def main(arguments: list[str] | None = None) -> None:
     """Run the `lang3dxl` command (its entry point)."""
     words = asked_for_all(sys.argv[1:] if arguments is None else arguments) or ["--help"]
+    keep_standard_numbers()
     silence_libraries()
     accept_any_console()
     if words[:1] == ["--version"]:
@@ -117,6 +118,7 @@ _REPEATED = ("--text", "--ask", "--not", "--segment", "--forget")
 
 def _parsed(words: Sequence[str]) -> Any:
     """Parse the words into the called command with its settings. Exits with a hint if they are not valid."""
+    _check_no_empty(words)
     _check_name(COMMANDS, words)
     words = with_data_as_taken(with_all_texts(words))
     try:
@@ -160,6 +162,14 @@ def with_data_as_taken(words: Sequence[str]) -> list[str]:
     if named and words[1:] and not words[1].startswith("-"):
         return [words[0], "--data", *words[1:]]
     return list(words)
+
+
+def _check_no_empty(words: Sequence[str]) -> None:
+    """Check that no word is empty. Raises UserError otherwise: as a path it would be the current folder."""
+    for before, word in zip(("lang3dxl", *words), words, strict=False):
+        if not word or (word.startswith("--") and word.endswith("=")):
+            where = word.rstrip("=") or before
+            raise UserError(f"what follows {where} is empty, as a variable that is not set: give a value")
 
 
 def _check_name(commands: Mapping[str, Any], words: Sequence[str], above: str = "lang3dxl") -> None:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import errno
 import io
 import os
+import stat
 import sys
 import threading
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence, Sized
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import cache, partial
 from typing import TypeVar
 
@@ -39,7 +41,8 @@ def progress(what: str, total: int) -> Iterator[Callable[..., None]]:
         timer.cancel()
         timer.join()
         if bar.live.is_started:  # otherwise it would print an empty line
-            bar.stop()
+            with _outliving_terminals():
+                bar.stop()
 
 
 def tracked(items: Iterable[Item], what: str, total: int | None = None) -> Iterator[Item]:
@@ -51,15 +54,38 @@ def tracked(items: Iterable[Item], what: str, total: int | None = None) -> Itera
 
 
 def say(*lines: str) -> None:
-    """Print lines verbatim: no rich markup, no wrapping, no control characters."""
+    """Print lines verbatim: no rich markup, no wrapping, no control characters. What the output's encoding
+    lacks is escaped."""
     from rich import get_console
 
+    console = get_console()
     for line in lines:
-        get_console().print(printable(line), markup=False, highlight=False, soft_wrap=True)
+        shown = printable(line).encode(console.encoding, "backslashreplace").decode(console.encoding)
+        with _outliving_terminals():
+            console.print(shown, markup=False, highlight=False, soft_wrap=True)
 
 
 say_once = cache(say)
 """Like `say`, but once per process."""
+
+
+@contextmanager
+def _outliving_terminals() -> Iterator[None]:
+    """Go on without output if its terminal is gone, as that of a job in the background may be."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno != errno.EIO:
+            raise
+        leave_terminal()
+
+
+def leave_terminal() -> None:
+    """Discard from now on what is printed to a terminal."""
+    for number in (1, 2):
+        with suppress(OSError):
+            if stat.S_ISCHR(os.fstat(number).st_mode):
+                os.dup2(os.open(os.devnull, os.O_WRONLY), number)
 
 
 def accept_any_console() -> None:
@@ -67,6 +93,16 @@ def accept_any_console() -> None:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
+
+
+def keep_standard_numbers() -> None:
+    """Open the null device in place of a standard stream that the caller closed: a file of ours would get its
+    number, and what libraries print would be written into it."""
+    for number in range(3):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)  # the least free number
 
 
 def silence_libraries() -> None:

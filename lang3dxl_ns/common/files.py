@@ -172,14 +172,12 @@ def file_locked(path: Path) -> Iterator[None]:
 
 def replace_durably(partial: Path, path: Path) -> None:
     """Move a finished file over another one. A loss of power leaves one of the two intact."""
-    with partial.open("rb") as file:
+    with partial.open("r+b") as file:  # Windows syncs no file that is open for reading alone
         os.fsync(file.fileno())
     os.replace(partial, path)
-    folder = os.open(path.parent, os.O_RDONLY)
-    try:
+    with contextlib.suppress(OSError), contextlib.ExitStack() as held:  # shares and Windows sync no folder
+        held.callback(os.close, folder := os.open(path.parent, os.O_RDONLY))
         os.fsync(folder)
-    finally:
-        os.close(folder)
 
 
 def followed(path: Path) -> Path:
@@ -211,6 +209,8 @@ def check_room(folder: Path, needed: float, what: str, remedy: str) -> int:
 def expanded(path: str | Path) -> Path:
     """Replace ~ in a path. Raises UserError for the home of an unknown user, and for what no path can be."""
     name = os.fsencode(path)
+    if not name:
+        raise UserError("a path is empty, which would be the current folder: name it, or write .")
     if b"\0" in name or len(name) > _LONGEST_PATH or any(len(part) > 255 for part in name.split(b"/")):
         begin = os.fsdecode(name[:60])
         raise UserError(f"{begin} … is not a path (too long, or a null character): choose a shorter name")

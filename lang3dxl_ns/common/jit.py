@@ -5,9 +5,9 @@ from __future__ import annotations
 import functools
 import hashlib
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -27,10 +27,21 @@ def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
         with suppress(AttributeError):
             stored: Any = compiled._cache._cache_file  # type: ignore[attr-defined]
             stored._source_stamp = stored._source_stamp, _shared_sources()
+            compiled._cache._guard_against_spurious_io_errors = functools.partial(_forgiven, stored)
     except RuntimeError:  # numba raises this if there is no cache folder
         compiled = numba.njit(nogil=True, error_model="numpy")(function)
     _announcement.kernels.add(id(compiled))
     return compiled
+
+
+@contextmanager
+def _forgiven(stored: Any) -> Iterator[None]:
+    """Empty a kernel's cache that can't be read or written, and go on: a loss of power leaves empty files."""
+    try:
+        yield
+    except Exception:
+        with suppress(OSError):
+            stored.flush()
 
 
 @functools.cache

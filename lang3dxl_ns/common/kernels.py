@@ -31,10 +31,12 @@ def takes_kernels(tensor: Tensor) -> bool:
 def numba_works() -> bool:
     """Return whether numba is installed and compiles; report one that is broken, as by another numpy."""
     try:
-        import numba  # noqa: F401
+        import numba
 
         from lang3dxl_ns.common import jit
 
+        if numba.config.DISABLE_JIT:  # Python itself would take hours
+            raise RuntimeError("NUMBA_DISABLE_JIT is set")
         jit.successor(0)
     except Exception as error:  # of any kind, depending on the mismatch
         if not (isinstance(error, ModuleNotFoundError) and error.name == "numba"):

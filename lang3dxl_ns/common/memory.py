@@ -14,14 +14,23 @@ T = TypeVar("T")
 
 _CGROUPS = Path("/sys/fs/cgroup")
 _OWN = Path("/proc/self/cgroup")
+_UNKNOWN = 8 << 30
+"""Bytes that are taken for a machine's memory where the system doesn't tell."""
 _LIMITS = {"": "memory.max", "memory": "memory/memory.limit_in_bytes"}
 """Files with the memory limit of a group, by the controllers that `_OWN` names: none in version 2."""
 
 
 def machine_memory() -> int:
-    """Return the bytes of main memory that this process may use: the machine's, or the least limit of the
-    control groups that it is in (a container's, a service's, a batch job's), which is often far lower."""
-    total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    """Return the bytes of main memory that this process may use: the machine's, or the least limit of its
+    own (`ulimit -v`) and of the control groups that it is in (a container's, a service's, a batch job's)."""
+    total = _UNKNOWN
+    if hasattr(os, "sysconf"):  # Windows has none
+        total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    with suppress(ImportError):  # Windows has none
+        import resource
+
+        own = resource.getrlimit(resource.RLIMIT_AS)[0]
+        total = total if own == resource.RLIM_INFINITY else min(total, own)
     for path in _limit_files():
         with suppress(OSError):
             text = path.read_text().strip()

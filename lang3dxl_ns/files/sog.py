@@ -60,10 +60,17 @@ def encode_sog(splats: Splats) -> bytes:
     }
     written = io.BytesIO()
     with zipfile.ZipFile(written, "w", zipfile.ZIP_STORED) as bundle:
-        bundle.writestr("meta.json", json.dumps(about))
+        bundle.writestr(_part("meta.json"), json.dumps(about))
         for name, values in pictures.items():
-            bundle.writestr(name, _picture(values))
+            bundle.writestr(_part(name), _picture(values))
     return written.getvalue()
+
+
+def _part(name: str) -> zipfile.ZipInfo:
+    """Describe a part without the time, since a ZIP can't hold that of a clock before 1980."""
+    part = zipfile.ZipInfo(name)
+    part.external_attr = 0o644 << 16
+    return part
 
 
 def _indexed(values: Float32[Array, "n 3"]) -> tuple[UInt8[Array, "n 3"], list[float]]:

@@ -13,7 +13,7 @@ from typing import Any
 
 import torch
 
-from lang3dxl_ns.common.errors import UserError, readable
+from lang3dxl_ns.common.errors import UserError, in_a_line, readable
 from lang3dxl_ns.common.files import check_regular, expanded
 from lang3dxl_ns.common.options import data_option
 from lang3dxl_ns.preparation.settings import DENSE_MODEL
@@ -97,13 +97,13 @@ def check_encoders(clip: str, dense: str) -> None:
     """Find both encoders, downloading missing ones; "none" and "auto" are skipped. Raises a single UserError
     that names all unavailable ones and the remedy."""
     wanted = {CLIP_OPTION: clip, DENSE_OPTION: dense}
-    missing: dict[str, str] = {}
+    missing, reason = dict[str, str](), ""
     for option, name in wanted.items():
         try:
             if name not in ("none", "auto"):
                 find_model(name, option)
-        except _NotDownloaded:
-            missing[option] = name
+        except _NotDownloaded as error:
+            missing[option], reason = name, in_a_line(error.__cause__ or error)
     if missing:
         folders = {option: f"DIR/{name.split('/')[-1]}" for option, name in missing.items()}
         fetch = "; ".join(f"hf download {missing[o]} --local-dir {folders[o]}" for o in missing)
@@ -113,8 +113,8 @@ def check_encoders(clip: str, dense: str) -> None:
         way_out = small if CLIP_OPTION in missing else without
         raise UserError(
             f"{' and '.join(missing.values())}: neither folders here nor in the Hugging Face cache, and "
-            f"the download fails. Either {way_out}. Or, on a machine with Internet: {fetch}; copy DIR here, "
-            f"and use {use}"
+            f"the download fails ({reason}). Either {way_out}. Or, on a machine with Internet: {fetch}; copy "
+            f"DIR here, and use {use}"
         )
 
 
@@ -183,10 +183,10 @@ def _download(name: str, option: str) -> Path:
             f"{name} is gated: accept its license at https://huggingface.co/{name}, log in here with "
             "`hf auth login`, and run the same command again"
         ) from error
-    except (OSError, ValueError) as error:  # no network, no such model, not a name
+    except Exception as error:  # no network, no such model, not a name, an unusable proxy
         raise _NotDownloaded(
             f"the model {name} is neither a folder here nor in the Hugging Face cache, and it can't be "
-            f"downloaded ({type(error).__name__}). On a machine with Internet: "
+            f"downloaded ({in_a_line(error)}). On a machine with Internet: "
             f"hf download {name} --local-dir DIR; then {data_option(option)} DIR"
         ) from error
     raise UserError(f"the model {name} has no PyTorch weights ({' or '.join(_WEIGHTS)}): choose another")

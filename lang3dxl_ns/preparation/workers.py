@@ -61,7 +61,8 @@ def _run_in_processes(count: int, start: Start[Item, Result], items: Sequence[It
     except BrokenProcessPool as error:
         raise UserError(
             f"one of the {count} processes died, perhaps because memory ran out: what they have made is "
-            f"kept; run the same command again, with fewer {data_option('workers')}"
+            f"kept; run the same command again, with fewer {data_option('workers')}. A script has to start "
+            'processes below if __name__ == "__main__"'
         ) from error
     finally:
         pool.shutdown(wait=False, cancel_futures=True)

@@ -6,6 +6,7 @@ import json
 import re
 import shutil
 import subprocess
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 from tempfile import TemporaryFile
@@ -154,11 +155,18 @@ def _duration(video: Path) -> float:
     return (times[-1] - times[0]) * len(times) / max(len(times) - 1, 1)
 
 
+def _ran(command: Sequence[str]) -> subprocess.CompletedProcess[str]:
+    """Run a program to its end. It repeats names and titles, which may be in any encoding."""
+    return subprocess.run(
+        command, stdin=_SILENT, capture_output=True, encoding="utf-8", errors="replace", check=False
+    )
+
+
 def _probed(video: Path, entries: str) -> dict[str, Any]:
     """Ask ffprobe about a video. Raises UserError for a file without a video that it reads."""
     asked = ("-select_streams", "v:0", "-show_entries", entries, "-of", "json")
     command = [*_reading("ffprobe", video), *asked]
-    found = subprocess.run(command, stdin=_SILENT, capture_output=True, text=True, check=False)
+    found = _ran(command)
     reason = " ".join(found.stderr.split())[-200:] or "it holds no pictures"
     with suppress(ValueError, KeyError):
         answer = json.loads(found.stdout)
@@ -175,7 +183,7 @@ def _write(video: Path, folder: Path, chosen: Int[Array, " s"]) -> None:
     wanted = "+".join(f"eq(n,{index})" for index in chosen)
     command = [*_reading("ffmpeg", video), *_each(f"select='{wanted}'")]
     command += ["-q:v", "2", str(partial).replace("%", "%%") + "/frame_%05d.jpg"]
-    done = subprocess.run(command, stdin=_SILENT, capture_output=True, text=True, check=False)
+    done = _ran(command)
     if done.returncode or not any(partial.iterdir()):
         said = " ".join(done.stderr.split())[-200:]
         raise UserError(f"ffmpeg can't write frames of {video} to {folder} ({said}): free space, or move it")

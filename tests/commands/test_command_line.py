@@ -15,6 +15,7 @@ from lang3dxl_ns import cli
 from lang3dxl_ns.commands.query import file_names
 from lang3dxl_ns.common.console import accept_any_console
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.files import expanded
 
 
 def shell(line: str, **environment: str) -> subprocess.CompletedProcess:
@@ -82,6 +83,23 @@ def test_a_text_without_its_flag_is_told(capsys):
     assert "Texts follow --text" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("words", "before"),
+    [
+        (["train", ""], "train"),
+        (["export", "a.scene", "--web", "", "--title", "x"], "--web"),
+        (["export", "a.scene", "--web="], "--web"),
+    ],
+)
+def test_a_variable_that_is_not_set_is_not_the_current_folder(words, before, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit, match=f"what follows {before} is empty"):
+        cli.main(words)
+    with pytest.raises(UserError, match="a path is empty"):
+        expanded("")
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.parametrize("flag", ["--text", "--ask", "--not"])
 def test_several_texts_may_follow_their_flag_and_the_scene_too(flag, tmp_path):
     scene = str(tmp_path)
@@ -135,6 +153,15 @@ def test_a_folder_that_is_gone_is_named(tmp_path, monkeypatch):
 def test_a_closed_output_is_no_error(monkeypatch):
     monkeypatch.setattr(sys, "stdout", None)
     cli.main(["preset", "official"])
+
+
+def test_no_file_gets_the_number_of_a_stream_that_was_closed(tmp_path):
+    """What libraries print there would be written into it."""
+    cli_main = "from lang3dxl_ns.cli import main; main(['--version'])"
+    code = f"{cli_main}; file = open('out', 'w'); file.write(str(file.fileno()))"
+    words = [sys.executable, "-c", code]
+    subprocess.run(["bash", "-c", '"$@" <&- >&- 2>&-', "bash", *words], cwd=tmp_path, timeout=120, check=True)
+    assert int((tmp_path / "out").read_text()) > 2
 
 
 def test_a_full_output_is_one_line():

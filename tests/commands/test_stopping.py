@@ -3,6 +3,7 @@
 import atexit
 import importlib
 import os
+import pty
 import signal
 import subprocess
 import sys
@@ -143,6 +144,39 @@ def test_a_signal_after_a_command_has_told_its_end_ends_it_without_a_word(number
 def test_a_signal_that_the_caller_ignores_stays_ignored_at_a_commands_end():
     ended = signaled(signal.SIGINT, "SIG_IGN", "--help")
     assert ended.returncode == 0 and "went on" in ended.stdout
+
+
+HUNG_UP = """
+import signal, sys, time
+from pathlib import Path
+from lang3dxl_ns.common.console import say
+from lang3dxl_ns.common.stopping import stoppable
+signal.signal(signal.SIGHUP, getattr(signal, sys.argv[1]))
+asked = []
+with stoppable(asked.append):
+    print("ready", flush=True)
+    signal.signal(signal.SIGALRM, lambda *_: asked.append("nothing else"))
+    signal.alarm(3)
+    while not asked:
+        time.sleep(0.01)
+    say("Saving", "what was learned")
+    print("to a file", file=sys.stderr, flush=True)
+Path(sys.argv[2]).write_text(str(asked))
+"""
+"""Work that notes what asks it to stop, and saves then."""
+
+
+@pytest.mark.parametrize(("handler", "asks"), [("SIG_DFL", "SIGHUP"), ("SIG_IGN", "nothing else")])
+def test_a_lost_terminal_asks_training_to_save_unless_nohup_says_otherwise(tmp_path, handler, asks):
+    child, terminal = pty.fork()
+    if child == 0:
+        os.execv(sys.executable, [sys.executable, "-c", HUNG_UP, handler, str(tmp_path / "saved")])
+    told = b""
+    while b"ready" not in told:
+        told += os.read(terminal, 1000)
+    os.close(terminal)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+    assert asks in (tmp_path / "saved").read_text()
 
 
 def end_of_nerfstudio() -> None:

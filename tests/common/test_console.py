@@ -1,5 +1,7 @@
 """What the console shows, and what it doesn't."""
 
+import io
+import sys
 import time
 import warnings
 
@@ -8,7 +10,7 @@ import rich.progress
 import torch
 
 from lang3dxl_ns.common import console
-from lang3dxl_ns.common.console import progress, silence_libraries, some, tracked
+from lang3dxl_ns.common.console import progress, say, silence_libraries, some, tracked
 from lang3dxl_ns.evaluation.photo_metrics import ImageMetrics
 
 
@@ -63,6 +65,15 @@ def test_the_time_left_is_that_of_equal_lots(monkeypatch):
             if done > 1:
                 left = bars[0].tasks[0].time_remaining
                 assert left == pytest.approx((lots - done) * seconds, rel=0.1, abs=1)
+
+
+def test_an_output_that_lacks_a_character_ends_no_script(monkeypatch):
+    """Windows gives a file that output is sent to the encoding of its own language."""
+    narrow = io.TextIOWrapper(io.BytesIO(), encoding="cp1252")
+    monkeypatch.setattr(sys, "stdout", narrow)
+    say("Фото of Köln")
+    narrow.flush()
+    assert narrow.buffer.getvalue() == b"\\u0424\\u043e\\u0442\\u043e of K\xf6ln\n"
 
 
 def test_a_name_with_a_line_break_stays_in_its_line():

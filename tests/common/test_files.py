@@ -2,6 +2,7 @@
 
 import errno
 import os
+import stat
 from functools import partial
 
 import pytest
@@ -39,6 +40,21 @@ def test_what_replaces_a_file_is_on_the_disk_before(tmp_path, monkeypatch):
     write_atomically(tmp_path / "b.json", "new")
     assert calls == ["fsync", "replace", "fsync", "fsync", "replace"]
     assert (tmp_path / "a.ckpt").read_text() == (tmp_path / "b.json").read_text() == "new"
+
+
+def test_a_disk_that_syncs_no_folder_takes_a_checkpoint(tmp_path, monkeypatch):
+    """As shares, and folders of Windows under Linux."""
+    fsync = os.fsync
+
+    def of_files(file):
+        if stat.S_ISDIR(os.fstat(file).st_mode):
+            raise OSError(errno.EINVAL, "Invalid argument")
+        fsync(file)
+
+    monkeypatch.setattr(os, "fsync", of_files)
+    (tmp_path / "partial").write_text("new")
+    replace_durably(tmp_path / "partial", tmp_path / "a.ckpt")
+    assert [path.name for path in tmp_path.iterdir()] == ["a.ckpt"]
 
 
 def test_a_device_or_a_pipe_is_written_to_and_a_link_stays_a_link(tmp_path):

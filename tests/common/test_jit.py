@@ -79,6 +79,20 @@ def test_without_a_folder_that_can_be_written_a_kernel_is_compiled_anew(run, tmp
     assert not list(Path(tmp_path).rglob("*.nbi"))
 
 
+@pytest.mark.parametrize("left", ["nbi", "nbc", "folder"])
+def test_a_cache_that_a_loss_of_power_left_empty_is_made_anew(run, tmp_path, left):
+    run()
+    files = [path for path in tmp_path.rglob("*.nb*") if left == "folder" or path.suffix == f".{left}"]
+    for path in files:
+        path.write_bytes(b"")
+        if left == "folder":  # neither read nor written
+            path.unlink()
+            path.mkdir()
+    assert files and all(run().endswith("[0. 2. 4.]\n") for _ in range(2))
+    if left != "folder":
+        assert run().count("Compiling") == 0
+
+
 def test_the_probe_of_the_compiler_needs_no_folder_that_can_be_written(tmp_path):
     (tmp_path / "jit_module.py").write_text(Path(jit.__file__).read_text())
     (tmp_path / "__pycache__").write_text("a file where the folder would be")

@@ -2,6 +2,7 @@
 
 import sys
 
+import numba
 import pytest
 import torch
 
@@ -49,6 +50,18 @@ def test_a_numba_that_loads_but_does_not_compile_is_told_of(monkeypatch, capsys)
     assert "numba does not work (LLVM ERROR: unsupported processor)" in " ".join(
         capsys.readouterr().out.split()
     )
+
+
+def test_a_numba_that_is_told_not_to_compile_is_left_alone(monkeypatch, capsys):
+    """Python itself would run the kernels, for hours."""
+    monkeypatch.delenv("LANG3DXL_CPU_KERNELS", raising=False)
+    monkeypatch.setattr(numba.config, "DISABLE_JIT", 1)
+    numba_works.cache_clear()
+    try:
+        assert not takes_kernels(torch.zeros(3))
+    finally:
+        numba_works.cache_clear()
+    assert "NUMBA_DISABLE_JIT is set" in capsys.readouterr().out
 
 
 def test_an_unknown_name_of_kernels_is_an_error(monkeypatch):

@@ -1,5 +1,8 @@
 """Memory limits of control groups: the least of all groups above a process counts, in both versions."""
 
+import os
+import resource
+
 import pytest
 
 from lang3dxl_ns.common import memory
@@ -43,3 +46,17 @@ def test_groups_of_the_first_version_count_too(groups):
 def test_a_group_that_this_container_does_not_show_is_left_out(groups):
     assert groups("0::/../../host/group\n", memory_max=GB // 2) == GB // 2
     assert groups("nonsense\n") == GB // 2
+
+
+def test_a_processs_own_limit_counts_too(groups, monkeypatch):
+    """As batch systems set it."""
+    monkeypatch.setattr(resource, "getrlimit", lambda kind: (2 * GB, 4 * GB))
+    assert groups("0::/box", box__memory_max=3 * GB) == 2 * GB
+    assert groups("0::/box", box__memory_max=1 * GB) == 1 * GB
+
+
+def test_a_system_that_tells_no_memory_is_planned_for_all_the_same(groups, monkeypatch):
+    """Windows has no sysconf."""
+    monkeypatch.delattr(os, "sysconf")
+    assert groups("") == 8 * GB
+    assert groups("0::/box", box__memory_max=3 * GB) == 3 * GB

@@ -264,6 +264,13 @@ def test_what_ffmpeg_says_of_a_video_that_it_cannot_read_is_told(tmp_path):
 
 
 @needs_ffmpeg
+def test_a_video_whose_name_is_in_another_encoding_is_told(tmp_path):
+    video = Path(os.fsdecode(os.fsencode(tmp_path) + b"/caf\xe9.mp4"))
+    video.write_bytes(b"not a video")
+    with pytest.raises(UserError, match=r"caf.*\.mp4 is not a video that ffmpeg reads"):
+        extract_frames(video)
+
+
 def test_a_second_command_that_reads_the_same_video_ends_at_once(walk, tmp_path):
     film = make_video(walk, tmp_path / "walk.mp4")
     with locked(tmp_path / "walk_photos"), pytest.raises(UserError, match="another command writes frames"):

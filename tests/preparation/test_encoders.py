@@ -241,6 +241,26 @@ def test_whoever_is_offline_is_told_of_the_missing_encoders_and_of_two_ways_out(
         check_encoders(clip, DINO)
 
 
+@pytest.mark.parametrize(
+    ("error", "reason"),
+    [
+        (ImportError("Using SOCKS proxy, but the 'socksio' package is not installed."), "socksio"),
+        (OSError(28, "No space left on device"), "No space left on device"),
+    ],
+)
+def test_why_a_model_cannot_be_downloaded_is_told(monkeypatch, error, reason):
+    import huggingface_hub
+
+    def fails(*_, **__):
+        raise error
+
+    monkeypatch.setattr(huggingface_hub, "snapshot_download", fails)
+    with pytest.raises(UserError, match=rf"the download fails \(.*{reason}.*\)\. Either use"):
+        check_encoders(CLIP, DINO)
+    with pytest.raises(UserError, match=rf"can't be downloaded \(.*{reason}.*\)\. On a machine"):
+        load_dense_encoder(DINO, "cpu")
+
+
 def test_an_encoder_that_is_here_is_not_asked_for(tiny_clip):
     with pytest.raises(UserError) as told:
         check_encoders(str(tiny_clip), DINO)

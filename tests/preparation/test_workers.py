@@ -23,7 +23,7 @@ def test_every_item_comes_back_with_its_result(tmp_path, forked_workers, count):
 
 
 def test_a_process_that_is_killed_ends_in_a_sentence_and_keeps_what_was_done(tmp_path):
-    with pytest.raises(UserError, match="fewer --workers"):
+    with pytest.raises(UserError, match=r"fewer --workers\. A script .* if __name__"):
         dict(run(PreparationConfig(workers=2), Squares(tmp_path, deadly=5).start, range(12), "cpu"))
     assert list(tmp_path.glob("*.*"))
 
