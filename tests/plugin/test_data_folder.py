@@ -271,6 +271,7 @@ def test_a_video_whose_name_is_in_another_encoding_is_told(tmp_path):
         extract_frames(video)
 
 
+@needs_ffmpeg
 def test_a_second_command_that_reads_the_same_video_ends_at_once(walk, tmp_path):
     film = make_video(walk, tmp_path / "walk.mp4")
     with locked(tmp_path / "walk_photos"), pytest.raises(UserError, match="another command writes frames"):
