@@ -25,9 +25,10 @@ def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
         compiled = numba.njit(nogil=True, error_model="numpy", cache=True)(function)
         # numba looks at the kernel's own file alone, but functions and constants are compiled in from others.
         with suppress(AttributeError):
-            stored: Any = compiled._cache._cache_file  # type: ignore[attr-defined]
+            cache: Any = compiled._cache  # type: ignore[attr-defined]
+            stored = cache._cache_file
             stored._source_stamp = stored._source_stamp, _shared_sources()
-            compiled._cache._guard_against_spurious_io_errors = functools.partial(_forgiven, stored)
+            cache._guard_against_spurious_io_errors = functools.partial(_forgiven, stored)
     except RuntimeError:  # numba raises this if there is no cache folder
         compiled = numba.njit(nogil=True, error_model="numpy")(function)
     _announcement.kernels.add(id(compiled))

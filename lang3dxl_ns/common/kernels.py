@@ -35,7 +35,7 @@ def numba_works() -> bool:
 
         from lang3dxl_ns.common import jit
 
-        if numba.config.DISABLE_JIT:  # Python itself would take hours
+        if numba.config.DISABLE_JIT:  # type: ignore[attr-defined]  # Python itself would take hours
             raise RuntimeError("NUMBA_DISABLE_JIT is set")
         jit.successor(0)
     except Exception as error:  # of any kind, depending on the mismatch

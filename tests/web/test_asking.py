@@ -278,10 +278,11 @@ def test_without_webgl_it_says_what_helps(browser, address):
 def test_a_script_that_cant_run_is_told(browser, address):
     """As by servers on Windows, whose registry may call .js files text, and in browsers that are too old."""
     lost, text, odd = {"status": 404}, {"content_type": "text/plain"}, {"body": "let = ="}
+    told = {}
     for script, answer in (("page", lost), ("page", odd), ("history", lost), ("history", text)):
         page = browser.new_page()
-        told = {"body": "export {}", "content_type": "text/javascript"} | answer
-        page.route(f"**/{script}.js", lambda route, told=told: route.fulfill(**told))
+        told.update({"status": 200, "body": "export {}", "content_type": "text/javascript"} | answer)
+        page.route(f"**/{script}.js", lambda route: route.fulfill(**told))
         page.goto(address)
         until_told(page, "#status", "The page's scripts can't run")
         page.close()
