@@ -24,6 +24,7 @@ from lang3dxl_ns.common.console import progress, say, tracked
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import absolute, locked, replace_file
 from lang3dxl_ns.common.reports import timed
+from lang3dxl_ns.common.stages import roughly
 from lang3dxl_ns.scene.camera_picture import camera_picture
 from lang3dxl_ns.scene.colmap import load_pycolmap
 from lang3dxl_ns.scene.colmap_files import read_model_files
@@ -37,6 +38,7 @@ from lang3dxl_ns.scene.matching import (
     quiet,
     usable,
 )
+from lang3dxl_ns.scene.pairing import EXHAUSTIVE
 from lang3dxl_ns.scene.photo_folder import PhotoFolder, find_photos, mention_passed_over
 from lang3dxl_ns.scene.placements import (
     LEAST_MATCHES,
@@ -72,6 +74,8 @@ hour of two cores."""
 _SOFT, _LAST_STEPS = 1.0, 10
 """Error in pixels from which a match counts less for the cameras in the end, and steps of this adjustment: a
 hundred move photos by under .003 pixels more."""
+_CORE_S, _CORE_S_MAPPED = 6.75, 0.005
+"""Seconds of a core for each photo, and for each with every other one in mapping."""
 _RELAXED = {"init_min_num_inliers": 30, "init_min_tri_angle": 4.0, "abs_pose_min_num_inliers": 15}
 """Thresholds of the incremental mapper where it finds no model with the usual ones."""
 
@@ -89,6 +93,13 @@ def reconstruct(
     say(f"{len(photos.names)} photos in {photos.folder}, without a COLMAP model: reconstructing")
     good, left_out = usable(photos)
     _check_enough(photos, good, left_out)
+    if len(good.names) > EXHAUSTIVE:
+        cores = os.cpu_count() or 1
+        time = roughly(core_seconds(len(good.names)) / cores)
+        say(
+            f"That takes {time} of {cores} cores with photos of 1,600 pixels, less with smaller ones. Once "
+            "stopped, the same command goes on"
+        )
     spent: dict[str, float] = {}
     with quiet():
         copies = numbered(good, work)
@@ -118,6 +129,12 @@ def reconstruct(
     told = asdict(report) | {"model": model_digest(model / "0")}
     replace_file(work / REPORT.name, json.dumps(told, indent=2))
     return report
+
+
+def core_seconds(photos: int) -> float:
+    """Estimate how long a core works on so many photos of 1,600 pixels with plain features, which is measured
+    for 200 and 1,000: features and pairs grow with their number, and mapping with its square."""
+    return photos * (_CORE_S + photos * _CORE_S_MAPPED)
 
 
 @dataclass(frozen=True)

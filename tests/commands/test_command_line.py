@@ -59,7 +59,7 @@ def test_without_words_the_help_is_shown(capsys):
         (["view", "none", "--host", "a" * 70], "is not an address of this machine"),
         (["query", "~nosuchuser/run", "--text", "a", "--out", "found"], "no such user"),
         (["demo-scene", "--out", "~nosuchuser/scene"], "no such user"),
-        (["prepare", "--data", __file__], r"test_command_line\.py is not a folder"),
+        (["prepare", "--data", __file__], r"test_command_line\.py is neither a folder"),
     ],
 )
 def test_mistakes_are_told_with_the_remedy(words, hint, tmp_path, monkeypatch):

@@ -368,6 +368,22 @@ def test_other_photos_begin_anew(photos):
     assert len(found) >= 5
 
 
+def test_of_many_photos_it_is_told_before_how_long_they_take(photos, monkeypatch, capsys):
+    reconstruct_scene(photos, photos.parent / "few", SIFT)
+    assert "of 3 cores" not in capsys.readouterr().out
+    shutil.rmtree(photos / "sparse")
+    monkeypatch.setattr(module, "EXHAUSTIVE", 6)
+    monkeypatch.setattr(module.os, "cpu_count", lambda: 3)
+    reconstruct_scene(photos, photos.parent / "many", SIFT)
+    told = capsys.readouterr().out
+    assert "That takes about 20 seconds of 3 cores" in told and "the same command goes on" in told
+
+
+@pytest.mark.parametrize(("count", "measured"), [(200, 1_559), (1_000, 12_000)])
+def test_times_that_are_told_are_those_that_were_measured(count, measured):
+    assert module.core_seconds(count) == pytest.approx(measured, rel=0.1)
+
+
 def test_photos_that_do_not_fit_are_named_with_the_reason(photos, capsys):
     rng = np.random.default_rng(0)
     folder = photos / "images"
