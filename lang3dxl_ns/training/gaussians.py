@@ -15,6 +15,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor, nn
 from torch.nn import Parameter
 
+from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.device import to_device
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.options import model_option, switched_on
@@ -27,6 +28,8 @@ Parameters = MutableMapping[str, Parameter] | nn.ParameterDict
 FIRST_OPACITY = 0.1
 FEWEST = 4
 """Smallest number of positions, so that each has three neighbors."""
+MOST = 1_000_000
+"""Largest number of points that Gaussians start from: a scanner's cloud has tens of millions."""
 
 LONGEST = 1.0
 """Longest standard deviation, relative to the scene's radius or, outside, to the distance from its center."""
@@ -46,8 +49,8 @@ def seed_positions(
     points: tuple[Tensor, Tensor] | None, count: int, side: float
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
     """Choose the initial positions of Gaussians and their colors (0…1): those of the points (whose colors are
-    bytes) or, without points, `count` random ones in a box with this side in world units. Raises UserError if
-    there are too few points."""
+    bytes), of some if there are over `MOST`, or, without points, `count` random ones in a box with this side
+    in world units. Raises UserError if there are too few points."""
     if points is None:
         return (torch.rand(count, 3) - 0.5) * side, torch.rand(count, 3)
     if len(points[0]) < FEWEST:
@@ -55,7 +58,12 @@ def seed_positions(
             f"the scene has {len(points[0])} 3D points, too few to start from: reconstruct it again (colmap "
             f"point_triangulator), or start from random Gaussians: {switched_on(model_option('random-init'))}"
         )
-    return points[0].float(), points[1].float() / 255
+    positions, colors = points
+    if len(positions) > MOST:
+        say(f"Gaussians start from {MOST:,} of the {len(positions):,} points; training adds what is missing")
+        kept = torch.randperm(len(positions), generator=torch.Generator().manual_seed(0))[:MOST]
+        positions, colors = positions[kept], colors[kept]
+    return positions.float(), colors.float() / 255
 
 
 def initial_gaussians(
