@@ -74,7 +74,7 @@ hour of two cores."""
 _SOFT, _LAST_STEPS = 1.0, 10
 """Error in pixels from which a match counts less for the cameras in the end, and steps of this adjustment: a
 hundred move photos by under .003 pixels more."""
-_CORE_S, _CORE_S_MAPPED = 6.75, 0.005
+_CORE_S, _CORE_S_MAPPED = 5.75, 0.01
 """Seconds of a core for each photo, and for each with every other one in mapping."""
 _RELAXED = {"init_min_num_inliers": 30, "init_min_tri_angle": 4.0, "abs_pose_min_num_inliers": 15}
 """Thresholds of the incremental mapper where it finds no model with the usual ones."""
@@ -132,8 +132,9 @@ def reconstruct(
 
 
 def core_seconds(photos: int) -> float:
-    """Estimate how long a core works on so many photos of 1,600 pixels with plain features, which is measured
-    for 200 and 1,000: features and pairs grow with their number, and mapping with its square."""
+    """Estimate how long a core works on so many photos of 1,600 pixels with plain features: features and pairs
+    grow with their number, and mapping with its square. Measured for 200, and for 1,000 until 451 had a pose
+    (docs/lab/reconstruction.md)."""
     return photos * (_CORE_S + photos * _CORE_S_MAPPED)
 
 
