@@ -132,9 +132,9 @@ def reconstruct(
 
 
 def core_seconds(photos: int) -> float:
-    """Estimate how long a core works on so many photos of 1,600 pixels with plain features: features and pairs
-    grow with their number, and mapping with its square. Measured for 200, and for 1,000 until 451 had a pose
-    (docs/lab/reconstruction.md)."""
+    """Estimate how long a core works on so many photos of 1,600 pixels with plain features. Features and
+    pairs grow with their number, and mapping with its square. Measured for 200, and for 1,000 until 451 had a
+    pose (docs/lab/reconstruction.md)."""
     return photos * (_CORE_S + photos * _CORE_S_MAPPED)
 
 
