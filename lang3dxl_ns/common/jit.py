@@ -40,7 +40,7 @@ def _forgiven(stored: Any) -> Iterator[None]:
     """Empty a kernel's cache that can't be read or written, and go on: a loss of power leaves empty files."""
     try:
         yield
-    except Exception:
+    except Exception:  # of any kind, from what unpickles a damaged file
         with suppress(OSError):
             stored.flush()
 

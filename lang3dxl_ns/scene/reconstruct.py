@@ -93,12 +93,12 @@ def reconstruct(
     say(f"{len(photos.names)} photos in {photos.folder}, without a COLMAP model: reconstructing")
     good, left_out = usable(photos)
     _check_enough(photos, good, left_out)
-    if len(good.names) > EXHAUSTIVE:
+    if len(good.names) > EXHAUSTIVE and settings.features in ("auto", "sift"):
         cores = os.cpu_count() or 1
         time = roughly(core_seconds(len(good.names)) / cores)
         say(
             f"That takes {time} of {cores} cores with photos of 1,600 pixels, less with smaller ones. Once "
-            "stopped, the same command goes on"
+            "stopped, the same command goes on with the features and pairs that it has"
         )
     spent: dict[str, float] = {}
     with quiet():
