@@ -47,6 +47,8 @@ _LENSES, _USUAL_LENS = (0.2, 10.0), 1.2
 """Focal lengths that lenses have, and that which COLMAP guesses, relative to the longer side."""
 _CHUNK_PHOTOS, _CHUNK_PAIRS, _CHUNK_LEARNED = 8, 100, 5  # a step of the bar, which a killed process loses
 _STAMP = "photos.json"
+SNAPSHOTS = "snapshots"
+"""Folder beside the database of what mapping with it has placed so far."""
 _TABLES = {"keypoints": 4, "descriptors": 1, "matches": 4, "two_view_geometries": 4}
 """Bytes per value in the database's tables of matrices."""
 
@@ -134,6 +136,7 @@ def feature_database(
         say(f"features of {len(told) - len(wanted)} of {len(told)} photos are kept, made with these settings")
     for old in (stamped, *work.glob("database.db*"), *work.glob("xfeat/*")):
         old.unlink(missing_ok=True)
+    shutil.rmtree(work / SNAPSHOTS, ignore_errors=True)
     importing.rename(database)
     replace_file(stamped, stamp)
     return database

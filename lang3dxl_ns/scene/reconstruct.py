@@ -1,14 +1,16 @@
 """Structure from motion: from a folder of photos to cameras, poses and points, with COLMAP's library.
 
-Features and matches outlive an interruption (`matching`); the model is written only when it is complete.
+Features and matches outlive an interruption (`matching`), and of mapping every hundred photos; the model is
+written only when it is complete.
 """
 
 from __future__ import annotations
 
 import json
 import os
+import shutil
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from importlib.util import find_spec
@@ -21,7 +23,7 @@ import numpy as np
 
 from lang3dxl_ns.common.checks import check_numbers
 from lang3dxl_ns.common.console import progress, say, tracked
-from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.errors import DAMAGE, UserError
 from lang3dxl_ns.common.files import absolute, locked, replace_file
 from lang3dxl_ns.common.reports import timed
 from lang3dxl_ns.common.stages import roughly
@@ -30,6 +32,7 @@ from lang3dxl_ns.scene.colmap import load_pycolmap
 from lang3dxl_ns.scene.colmap_files import read_model_files
 from lang3dxl_ns.scene.companions import work_folder
 from lang3dxl_ns.scene.matching import (
+    SNAPSHOTS,
     extract,
     feature_database,
     features_and_partners,
@@ -74,6 +77,8 @@ hour of two cores."""
 _SOFT, _LAST_STEPS = 1.0, 10
 """Error in pixels from which a match counts less for the cameras in the end, and steps of this adjustment: a
 hundred move photos by under .003 pixels more."""
+_SAVED = 100
+"""Photos that get a pose between two snapshots of mapping, from which a stopped one goes on."""
 _CORE_S, _CORE_S_MAPPED = 5.75, 0.01
 """Seconds of a core for each photo, and for each with every other one in mapping."""
 _RELAXED = {"init_min_num_inliers": 30, "init_min_tri_angle": 4.0, "abs_pose_min_num_inliers": 15}
@@ -98,7 +103,7 @@ def reconstruct(
         time = roughly(core_seconds(len(good.names)) / cores)
         say(
             f"That takes {time} of {cores} cores with photos of 1,600 pixels, less with smaller ones. Once "
-            "stopped, the same command goes on with the features and pairs that it has"
+            "stopped, the same command goes on with what it has"
         )
     spent: dict[str, float] = {}
     with quiet():
@@ -201,6 +206,7 @@ def _mapping(
         if contradicting:
             models = _map_without(contradicting, database, copies, work, settings.mapper) or models
             pairs = _measured_pairs(database, models)
+        shutil.rmtree(work / SNAPSHOTS, ignore_errors=True)
     return _Mapping(database, models, pairs, contradicting)
 
 
@@ -263,6 +269,8 @@ def _map(
     """Run the mapper and return the models, largest first. The incremental one may need `_RELAXED`."""
     pycolmap = load_pycolmap()
     settings = {"random_seed": 0, "num_threads": os.cpu_count() or 1}
+    snapshots = work / SNAPSHOTS
+    snapshots.mkdir(exist_ok=True)
     for thresholds in ({},) if kind == "global" else ({"abs_pose_min_num_inliers": points}, _RELAXED):
         bar = progress("photos with a pose", len(photos.names))
         with TemporaryDirectory(dir=work) as folder, bar as advance:
@@ -271,10 +279,14 @@ def _map(
                 found = pycolmap.global_mapping(database, photos.folder, folder, options)
             else:
                 options = pycolmap.IncrementalPipelineOptions(
-                    min_model_size=_SMALLEST_MODEL, extract_colors=False, mapper=thresholds, **settings
-                )
+                    min_model_size=_SMALLEST_MODEL, extract_colors=False, mapper=thresholds, **settings,
+                    snapshot_path=snapshots, snapshot_frames_freq=_SAVED,
+                )  # fmt: skip
+                begun = _largest_snapshot(snapshots, database)
+                if begun:
+                    advance(pycolmap.Reconstruction(begun).num_reg_images())
                 found = pycolmap.incremental_mapping(
-                    database, photos.folder, folder, options, next_image_callback=advance
+                    database, photos.folder, folder, options, begun or "", next_image_callback=advance
                 )
         models = [m for m in found.values() if m.num_reg_images() >= _SMALLEST_MODEL and m.num_points3D()]
         if models:
@@ -282,6 +294,21 @@ def _map(
     for model in tracked(models, "models completed"):
         _complete(model, database, photos)
     return sorted(models, key=lambda model: -model.num_reg_images())
+
+
+def _largest_snapshot(snapshots: Path, database: Path) -> Path | None:
+    """Find the largest snapshot of mapping that is whole and of the database's photos: COLMAP's library
+    crashes on others."""
+    pycolmap = load_pycolmap()
+    with pycolmap.Database.open(database) as db:
+        features = {i.image_id: db.num_keypoints_for_image(i.image_id) for i in db.read_all_images()}
+    for images in sorted(snapshots.glob("*/images.bin"), key=lambda path: -path.stat().st_size):
+        with suppress(UserError, *DAMAGE):  # cut off when the computer stopped
+            read_model_files(images.parent)
+            found = pycolmap.Reconstruction(images.parent).images
+            if all(features.get(number) == image.num_points2D() for number, image in found.items()):
+                return images.parent
+    return None
 
 
 def _complete(model: pycolmap.Reconstruction, database: Path, photos: PhotoFolder) -> None:
@@ -328,7 +355,7 @@ def _map_without(
     with TemporaryDirectory(dir=work) as folder:
         consistent = Path(folder) / "database.db"
         copy_without(pairs, database, consistent)
-        return _map(consistent, photos, work, kind, _POINTS_OF_TWINS)
+        return _map(consistent, photos, Path(folder), kind, _POINTS_OF_TWINS)
 
 
 def _publish(models: list[pycolmap.Reconstruction], model: Path) -> None:

@@ -164,7 +164,7 @@ def test_contradicting_pairs_are_left_out_of_a_second_model_but_where_the_mapper
     asked, mapping = [], pycolmap.incremental_mapping
 
     def watched(*files, **more):
-        asked.append(files[-1].mapper.abs_pose_min_num_inliers)
+        asked.append(files[3].mapper.abs_pose_min_num_inliers)
         return mapping(*files, **more)
 
     for step in (module.extract, module.match):  # without the learned networks
@@ -323,6 +323,47 @@ def test_a_stopped_reconstruction_goes_on_with_what_it_has(photos, monkeypatch, 
     assert len(matched) == 7 * 6 // 2 - (0 if damaged else 10)
 
 
+def stop_mapping(monkeypatch, after):
+    """Let the first mapping end, as by Ctrl+C, once so many photos followed the first two; note all these."""
+    incremental, placed = pycolmap.incremental_mapping, []
+
+    def mapping(*arguments, next_image_callback):
+        def noted():
+            next_image_callback()
+            placed.append(arguments)
+            if len(placed) == after:
+                raise KeyboardInterrupt
+
+        return incremental(*arguments, next_image_callback=noted)
+
+    monkeypatch.setattr(pycolmap, "incremental_mapping", mapping)
+    monkeypatch.setattr(module, "_SAVED", 1)
+    return placed
+
+
+@pytest.mark.parametrize("damage", ["", "images.bin", "points3D.bin", "another scene's"])
+def test_stopped_mapping_goes_on_from_its_last_snapshot(photos, scene, monkeypatch, damage):
+    placed = stop_mapping(monkeypatch, 3)
+    with pytest.raises(KeyboardInterrupt):
+        reconstruct_scene(photos, None, SIFT)
+    snapshots = photos / "lang3dxl_cache" / "reconstruction" / "snapshots"
+    left = sorted(snapshots.iterdir())
+    assert left and not (photos / "sparse").exists()
+    if damage.endswith(".bin"):
+        for path in left:
+            (path / damage).write_bytes((path / damage).read_bytes()[:-9])
+    elif damage:
+        shutil.rmtree(snapshots)
+        shutil.copytree(scene / "given" / "0", snapshots / "0")
+    _, model = reconstruct_scene(photos, None, SIFT)
+    assert not snapshots.exists()
+    assert len(placed) - 3 == (5 if damage else 2)
+    degrees, distances = pose_errors(model, scene / "given" / "0")
+    assert len(degrees) == 7
+    assert degrees.max() < 2.5
+    assert distances.max() < 0.15
+
+
 def test_large_collections_are_matched_in_rounds_that_go_on_where_they_stopped(photos, tmp_path, monkeypatch):
     """Every pair is tried once, and partners of partners are among them."""
     monkeypatch.setattr(pairing, "EXHAUSTIVE", 0)
@@ -405,10 +446,15 @@ def test_photos_that_do_not_fit_are_named_with_the_reason(photos, capsys):
     assert any("noise.jpg" in line for line in report.lines())
 
 
-def test_of_two_buildings_the_larger_is_used_and_the_other_told(photos, tmp_path):
+@pytest.mark.parametrize("stopped", [False, True])
+def test_of_two_buildings_the_larger_is_used_and_the_other_told(photos, tmp_path, monkeypatch, stopped):
     write_scene(tmp_path / "other", photos=4, size=(240, 180), paint=lambda points: speckled(points + 100))
     for path in (tmp_path / "other" / "images").iterdir():
         shutil.copy(path, photos / "images" / f"other_{path.name}")
+    if stopped:
+        stop_mapping(monkeypatch, 4)
+        with pytest.raises(KeyboardInterrupt):
+            reconstruct(find_photos(photos), photos / "work", photos / "sparse", SIFT)
     report = reconstruct(find_photos(photos), photos / "work", photos / "sparse", SIFT)
     assert report.registered == 7
     assert report.other_models == (4,)
