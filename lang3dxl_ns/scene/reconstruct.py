@@ -77,6 +77,9 @@ hour of two cores."""
 _SOFT, _LAST_STEPS = 1.0, 10
 """Error in pixels from which a match counts less for the cameras in the end, and steps of this adjustment: a
 hundred move photos by under .003 pixels more."""
+_GROWTH = 1.3
+"""Growth of a model after which all of it is adjusted. COLMAP's 1.1 takes a fourth to a half more time for
+the same places."""
 _SAVED = 100
 """Photos that get a pose between two snapshots of mapping, from which a stopped one goes on."""
 _CORE_S, _CORE_S_MAPPED = 5.75, 0.01
@@ -280,6 +283,7 @@ def _map(
             else:
                 options = pycolmap.IncrementalPipelineOptions(
                     min_model_size=_SMALLEST_MODEL, extract_colors=False, mapper=thresholds, **settings,
+                    ba_global_frames_ratio=_GROWTH, ba_global_points_ratio=_GROWTH,
                     snapshot_path=snapshots, snapshot_frames_freq=_SAVED,
                 )  # fmt: skip
                 begun = _largest_snapshot(snapshots, database)
