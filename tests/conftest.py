@@ -26,6 +26,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from processes import SERVER
 from runs import train_run
 from scenes import write_scene
 from tiny_models import make_tiny_clip, make_tiny_dinov2
@@ -158,6 +159,13 @@ def real_scenes() -> Path:
     if not folder:
         pytest.skip("set LANG3DXL_REAL_SCENES to the folder that holds sceaux and sceaux_wild")
     return Path(folder)
+
+
+@pytest.fixture
+def forked_workers(monkeypatch) -> None:
+    """Workers begin with the libraries loaded, which they would import for ten seconds each. The test of one
+    that is killed has a true start."""
+    monkeypatch.setattr("lang3dxl_ns.common.parallel.get_context", lambda _: SERVER)
 
 
 @pytest.fixture(params=["torch", "numba"])

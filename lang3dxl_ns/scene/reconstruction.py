@@ -43,6 +43,13 @@ class ReconstructionSettings:
     """Maximum number of features per photo."""
     one_camera: bool | None = None
     """Whether one camera with one lens took all photos. By default, EXIF and sizes decide."""
+    engine: Literal["local", "ray"] = "local"
+    """Where features are found and matched: on all cores of this machine, or by workers on a Ray cluster that
+    sees the same folders (extra [ray]). Mapping runs here."""
+    workers: int = 1
+    """Number of workers on the Ray cluster, of one core each."""
+    address: str | None = None
+    """Address of the Ray cluster, such as auto or ray://HOST:10001. By default one is started here."""
 
 
 @dataclass(frozen=True)

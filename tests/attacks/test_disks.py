@@ -13,12 +13,11 @@ import pytest
 import torch
 
 from lang3dxl_ns.cli import main
-from lang3dxl_ns.common import files
+from lang3dxl_ns.common import files, parallel
 from lang3dxl_ns.common.console import gigabytes
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.open_scene import load_scene
 from lang3dxl_ns.plugin.trainer import _disk_kept_out_of_training, writer
-from lang3dxl_ns.preparation import workers
 from lang3dxl_ns.preparation.settings import PreparationConfig
 from lang3dxl_ns.preparation.store import FeatureStore
 
@@ -157,13 +156,13 @@ def test_an_attempt_to_connect_that_never_ends_is_left_after_its_time(monkeypatc
     def ray(init):
         return SimpleNamespace(init=init, shutdown=lambda: closed.append(init))
 
-    workers._connect(ray(lambda **_: None), there)
+    parallel._connect(ray(lambda **_: None), there)
     with pytest.raises(UserError, match=r"answers at there \('x'\): give --address"):
-        workers._connect(ray(lambda **_: {}["x"]), there)
+        parallel._connect(ray(lambda **_: {}["x"]), there)
     assert len(closed) == 1
-    monkeypatch.setattr(workers, "PATIENCE_S", 0.01)
+    monkeypatch.setattr(parallel, "PATIENCE_S", 0.01)
     with pytest.raises(UserError, match="no answer within 0 s"):
-        workers._connect(ray(lambda **_: forever.wait()), there)
+        parallel._connect(ray(lambda **_: forever.wait()), there)
     forever.set()
     assert len(closed) == 1
 
@@ -172,11 +171,11 @@ def test_a_cluster_that_never_answers_is_one_line(monkeypatch, capsys):
     """A port that takes connections and says nothing."""
     ray = pytest.importorskip("ray")
     asked = []
-    monkeypatch.setattr(workers, "PATIENCE_S", 0.05)
+    monkeypatch.setattr(parallel, "PATIENCE_S", 0.05)
     monkeypatch.setattr(ray, "init", lambda **options: (asked.append(options), threading.Event().wait(30)))
     with socket.create_server(("127.0.0.1", 0)) as server:
         address = f"127.0.0.1:{server.getsockname()[1]}"
         with pytest.raises(UserError, match=f"no Ray cluster answers at {address}"):
-            list(workers.run(PreparationConfig(engine="ray", address=address), None, [1], "cpu"))
+            list(parallel.run(PreparationConfig(engine="ray", address=address), None, [1], "cpu"))
     assert [options["address"] for options in asked] == [address]
     assert f"connecting to the Ray cluster at {address}" in " ".join(capsys.readouterr().out.split())

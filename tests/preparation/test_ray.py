@@ -6,12 +6,16 @@ from pathlib import Path
 
 import pytest
 import torch
+from scenes import speckled, write_scene
 from tiny_models import make_tiny_clip
 from worker_tasks import Squares, prepare, write_photo
 
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.parallel import _connect, run
 from lang3dxl_ns.preparation.settings import PreparationConfig
-from lang3dxl_ns.preparation.workers import _connect, run
+from lang3dxl_ns.scene.colmap import read_reconstruction
+from lang3dxl_ns.scene.reconstruct import reconstruct_scene
+from lang3dxl_ns.scene.reconstruction import ReconstructionSettings
 
 pytestmark = pytest.mark.nightly
 
@@ -50,3 +54,11 @@ def test_workers_of_a_cluster_make_the_targets_that_one_process_makes(cluster, t
     several = prepare(tmp_path, clip, 2, "ray")
     torch.testing.assert_close(one, several)
     assert cluster.is_initialized()  # it was there before: it is left running
+
+
+def test_workers_of_a_cluster_find_the_features_and_matches_of_photos(cluster, tmp_path):
+    write_scene(tmp_path / "data", photos=7, size=(240, 180), paint=speckled)
+    shutil.rmtree(tmp_path / "data" / "sparse")
+    settings = ReconstructionSettings(features="sift", engine="ray", workers=2)
+    _, model = reconstruct_scene(tmp_path / "data", None, settings)
+    assert len(read_reconstruction(model).photos) == 7

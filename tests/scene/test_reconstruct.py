@@ -1,6 +1,7 @@
 """From photos to a COLMAP model: poses are right, what is left out is named, a stopped one goes on."""
 
 import os
+import pickle
 import shutil
 from pathlib import Path
 from types import SimpleNamespace
@@ -12,6 +13,7 @@ from PIL import Image
 from scenes import CENTER, HALF_SIZES, speckled, write_scene
 
 from lang3dxl_ns.commands.prepare import Reconstruct
+from lang3dxl_ns.common import parallel
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import locked
 from lang3dxl_ns.scene import matching, pairing
@@ -362,6 +364,70 @@ def test_stopped_mapping_goes_on_from_its_last_snapshot(photos, scene, monkeypat
     assert len(degrees) == 7
     assert degrees.max() < 2.5
     assert distances.max() < 0.15
+
+
+def matched_with(database):
+    """Features of each photo, and the pairs with verified matches."""
+    with pycolmap.Database.open(database) as db:
+        images = db.read_all_images()
+        features = {i.name: (db.read_keypoints(i.image_id), db.read_descriptors(i.image_id)) for i in images}
+        pairs, counts = db.read_two_view_geometry_num_inliers()
+    found = {name: [points, kind.data] for name, (points, kind) in features.items()}
+    return found, {pair for pair, count in zip(pairs, counts, strict=True) if count}
+
+
+def test_a_cluster_finds_what_this_machine_finds_and_keeps_what_it_found_when_stopped(
+    photos, scene, tmp_path, monkeypatch
+):
+    """Its workers are stood in for here; tests/preparation/test_ray.py has true ones."""
+    shutil.copytree(photos, tmp_path / "here")
+    reconstruct_scene(tmp_path / "here", None, SIFT)
+    done, most = [], [4]
+
+    def run(workers, start, items, device):
+        assert workers.workers == 3
+        work = pickle.loads(pickle.dumps(start))(device)
+        for item in items:
+            if len(done) == most[0]:
+                raise KeyboardInterrupt
+            yield item, pickle.loads(pickle.dumps(work(item)))
+            done.append(item)
+
+    monkeypatch.setattr(parallel, "run", run)
+    monkeypatch.setattr(matching, "_CHUNK_PHOTOS", 3)
+    monkeypatch.setattr(matching, "_CHUNK_PAIRS", 10)
+    settings = ReconstructionSettings(features="sift", engine="ray", workers=3)
+    with pytest.raises(KeyboardInterrupt):
+        reconstruct_scene(photos, None, settings)
+    most[0] = 100
+    _, model = reconstruct_scene(photos, None, settings)
+    assert [len(chunk) for chunk in done] == [3, 3, 1, 10, 10, 1]
+    work = Path("lang3dxl_cache", "reconstruction")
+    (theirs, pairs), (ours, known) = (
+        matched_with(folder / work / "database.db") for folder in (photos, tmp_path / "here")
+    )
+    assert pairs == known
+    for name, feature in ours.items():
+        for one, other in zip(feature, theirs[name], strict=True):
+            np.testing.assert_array_equal(one, other)
+    degrees, _ = pose_errors(model, scene / "given" / "0")
+    assert len(degrees) == 7 and degrees.max() < 2.5
+    assert not list((photos / work).glob("tmp*"))
+
+
+@pytest.mark.parametrize(
+    ("settings", "told"),
+    [
+        ({"workers": 2}, "are for --engine ray"),
+        ({"address": "auto"}, "are for --engine ray"),
+        ({"engine": "ray", "features": "xfeat"}, "SIFT's features alone"),
+        ({"engine": "ray", "workers": 0}, "--workers is 0"),
+    ],
+)
+def test_settings_of_a_cluster_without_effect_are_errors(photos, monkeypatch, settings, told):
+    monkeypatch.setattr(module, "find_spec", lambda name: True)
+    with pytest.raises(UserError, match=told):
+        reconstruct_scene(photos, None, ReconstructionSettings(**settings))
 
 
 def test_large_collections_are_matched_in_rounds_that_go_on_where_they_stopped(photos, tmp_path, monkeypatch):

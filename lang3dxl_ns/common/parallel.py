@@ -12,14 +12,13 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import get_context, parent_process
-from typing import Any, TypeAlias, TypeVar
+from typing import Any, Protocol, TypeAlias, TypeVar
 
 import torch
 
 from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.options import data_option
-from lang3dxl_ns.preparation.settings import PreparationConfig
 
 PATIENCE_S = 30.0
 """Seconds to wait for a named Ray cluster to answer."""
@@ -30,8 +29,24 @@ Start: TypeAlias = Callable[[str], Callable[[Item], Result]]
 It can be sent to another process."""
 
 
+class Workers(Protocol):
+    """Settings of workers."""
+
+    @property
+    def engine(self) -> str:
+        """Where they run: "local" or "ray"."""
+
+    @property
+    def workers(self) -> int:
+        """Number of workers."""
+
+    @property
+    def address(self) -> str | None:
+        """Address of the Ray cluster; None starts one here."""
+
+
 def run(
-    config: PreparationConfig, start: Start[Item, Result], items: Sequence[Item], device: str
+    config: Workers, start: Start[Item, Result], items: Sequence[Item], device: str
 ) -> Iterator[tuple[Item, Result]]:
     """Yield every item with its result, as they finish, from the configured workers. Raises the exceptions of
     the work, and UserError if a process dies; earlier results are kept."""
@@ -104,7 +119,7 @@ class _Actor:
         return item, self._work(item)
 
 
-def _run_on_ray(config: PreparationConfig, start: Start[Item, Result], items: Sequence[Item], device: str):
+def _run_on_ray(config: Workers, start: Start[Item, Result], items: Sequence[Item], device: str):
     try:
         import ray
         from ray.util import ActorPool
@@ -124,7 +139,7 @@ def _run_on_ray(config: PreparationConfig, start: Start[Item, Result], items: Se
             ray.shutdown()
 
 
-def _connect(ray: Any, config: PreparationConfig) -> None:
+def _connect(ray: Any, config: Workers) -> None:
     """Connect to the Ray cluster within the time limit, after which the attempt stays in a daemon thread, or
     start one here. Raises UserError if there is no answer."""
     # A cluster started here listens on this machine only.

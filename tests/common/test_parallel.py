@@ -6,8 +6,8 @@ import pytest
 from worker_tasks import Squares
 
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.parallel import run
 from lang3dxl_ns.preparation.settings import PreparationConfig
-from lang3dxl_ns.preparation.workers import run
 
 
 def processes(folder):
