@@ -9,6 +9,7 @@ import { seenAt } from "./space.js";
 const { LEVELS, LEAST, PART, DEPTH, FILLED, AGREED, PARTLY, SHARED, SPLINTER, VIEWS, CRUMB, OFTEN, OVER, OVERLAP, OUTLIERS, COLORED, APART, PRESENT, TOLD, SLIM, STRAIGHT, LIGHT_PART, ROUND, CROWN, LIGHT, PLACES, SHOWN } = language.things;
 const SIDE = 256; // pixels of a view's longer side
 const FIELDS = 10, MOST_KEPT = 5e5; // of an ellipse; ellipses of all views, 80 bytes each
+const X = 1, Y = 2, Z = 3, OPACITY = 4, REACH = 5, TALL = 6, HIGH = 7, SLOPE = 8, NARROW = 9; // places of an ellipse's fields
 const HIDDEN = 1e-3; // of a pixel's light: what lies behind is not seen
 const HOT = 0.1; // share of a pixel that one hot Gaussian covers where the map may be hot
 const FINE = 512; // steps of the falloff's table for each squared standard deviation
@@ -116,34 +117,49 @@ export function drawn(view, scene, heat) {
   const { small, points, ellipses } = projected(view, scene), { width, height } = small;
   const [map, depth, surface, clear] = [0, 1, 2, 3].map(() => new Float32Array(width * height));
   let [top, end] = [Infinity, 0]; // of the pixels that something hot reaches
-  for (const one of each(ellipses))
-    if (heat[one.i] > LEVELS[0] && one.opacity > HOT)
-      eachRow({ ...one, reach: 2 * Math.log(one.opacity / HOT) }, small, (first, last) => (clear.fill(1, first, last), (top = Math.min(top, first)), (end = Math.max(end, last))));
-  const next = new Int32Array(clear.length + 1).fill(clear.length); // leads to the next pixel that still matters
-  clear.forEach((light, at) => (next[at] = at + (light === 0)));
-  const open = (at) => {
-    while (next[at] !== at) at = next[at] = next[next[at]];
-    return at;
-  };
-  for (const one of each(ellipses)) {
-    const { i, y, z, opacity, narrow, high } = one;
-    if (y + high + 1 < top / width || y - high - 1 > end / width) continue;
-    eachRow(one, small, (first, last, aside, far) => {
-      for (let at = open(first); at < last; at = open(at + 1)) {
-        const d = aside + at - first, share = clear[at] * Math.min(opacity * FALLOFF[((narrow * d * d + far) * FINE + 0.5) | 0], 0.999);
-        clear[at] -= share;
-        map[at] += share * heat[i];
-        depth[at] += share * heat[i] * z;
-        surface[at] += share * z;
-        if (clear[at] < HIDDEN) next[at] = at + 1;
-      }
-    });
+  for (let k = 0; k < ellipses.length; k += FIELDS) {
+    const opacity = ellipses[k + OPACITY];
+    if (heat[ellipses[k]] > LEVELS[0] && opacity > HOT)
+      eachRow(ellipses, k, 2 * Math.log(opacity / HOT), small, (first, last) => (clear.fill(1, first, last), (top = Math.min(top, first)), (end = Math.max(end, last))));
   }
+  composite(ellipses, heat, small, top / width, end / width, { map, depth, surface, clear });
   for (let at = 0; at < width * height; at++) {
     if (map[at] > 0) depth[at] /= map[at];
     if (clear[at] < 1) surface[at] /= 1 - clear[at];
   }
   return { map, depth, surface, width, height, rows: view.rows, points, focal: small.fx };
+}
+
+/** Composite ellipses front to back at the pixels that are clear, between two rows. One function with loops alone: calls for each
+ * ellipse, row or pixel take a fifth more time. */
+function composite(flat, heat, { width, height }, top, end, { map, depth, surface, clear }) {
+  const next = new Int32Array(clear.length + 1).fill(clear.length); // leads to the next pixel that still matters
+  for (let at = 0; at < clear.length; at++) next[at] = at + (clear[at] === 0);
+  for (let k = 0; k < flat.length; k += FIELDS) {
+    const y = flat[k + Y], high = flat[k + HIGH];
+    if (y + high + 1 < top || y - high - 1 > end) continue;
+    const hot = heat[flat[k]], x = flat[k + X], z = flat[k + Z], opacity = flat[k + OPACITY], reach = flat[k + REACH], tall = flat[k + TALL], slope = flat[k + SLOPE], narrow = flat[k + NARROW];
+    const bottom = Math.min(Math.floor(y + high - 0.5), height - 1);
+    for (let row = Math.max(Math.ceil(y - high - 0.5), 0); row <= bottom; row++) {
+      const down = row + 0.5 - y, far = (down * down) / tall, wide = Math.sqrt(Math.max(reach - far, 0) / narrow), middle = x + slope * down - 0.5;
+      const begin = row * width, last = begin + Math.min(Math.floor(middle + wide), width - 1);
+      for (let at = begin + Math.max(Math.ceil(middle - wide), 0); at <= last; at++) {
+        const before = clear[at];
+        if (before < HIDDEN) {
+          let to = at;
+          while (next[to] !== to) to = next[to] = next[next[to]];
+          at = to - 1;
+          continue;
+        }
+        const aside = at - begin - middle, share = before * Math.min(opacity * FALLOFF[((narrow * aside * aside + far) * FINE + 0.5) | 0], 0.999), light = share * hot;
+        map[at] += light;
+        depth[at] += light * z;
+        surface[at] += share * z;
+        clear[at] = before - share;
+        if (before - share < HIDDEN) next[at] = at + 1;
+      }
+    }
+  }
 }
 
 const projections = new WeakMap(); // of views
@@ -171,13 +187,6 @@ function projected(view, scene) {
   return made;
 }
 
-/** List the ellipses of `projected`, one by one, in the order of `ellipseOf`'s fields. */
-function* each(flat) {
-  for (let k = 0; k < flat.length; k += FIELDS)
-    yield { i: flat[k], x: flat[k + 1], y: flat[k + 2], z: flat[k + 3], opacity: flat[k + 4], reach: flat[k + 5],
-      tall: flat[k + 6], high: flat[k + 7], slope: flat[k + 8], narrow: flat[k + 9] }; // prettier-ignore
-}
-
 /** Find the ellipse that a Gaussian fills in a view; null if it fills none. */
 function ellipseOf(view, { axes, opacities, antialiased }, i, [x, y, z]) {
   const [a, uv, b] = spreadAt(view, axes, i, [x, y, z]), uu = a + BLUR, vv = b + BLUR, area = uu * vv - uv * uv;
@@ -187,7 +196,8 @@ function ellipseOf(view, { axes, opacities, antialiased }, i, [x, y, z]) {
 
 /** Go through the rows of pixels that an ellipse fills: the first pixel, the one after the last, how far the first lies
  * to the right of the row's middle, and that one's squared distance in standard deviations. */
-function eachRow({ x, y, reach, tall, slope, narrow }, { width, height }, paint) {
+function eachRow(flat, k, reach, { width, height }, paint) {
+  const x = flat[k + X], y = flat[k + Y], tall = flat[k + TALL], slope = flat[k + SLOPE], narrow = flat[k + NARROW];
   const high = Math.sqrt(reach * tall), bottom = Math.min(Math.floor(y + high - 0.5), height - 1);
   for (let row = Math.max(Math.ceil(y - high - 0.5), 0); row <= bottom; row++) {
     const down = row + 0.5 - y, far = (down * down) / tall, wide = Math.sqrt(Math.max(reach - far, 0) / narrow), middle = x + slope * down - 0.5;
