@@ -296,8 +296,9 @@ def _map(
                 begun = _largest_snapshot(snapshots, database)
                 if begun:
                     advance(pycolmap.Reconstruction(begun).num_reg_images())
+                placed = partial(_count, advance, snapshots)
                 found = pycolmap.incremental_mapping(
-                    database, photos.folder, folder, options, begun or "", next_image_callback=advance
+                    database, photos.folder, folder, options, begun or "", next_image_callback=placed
                 )
         models = [m for m in found.values() if m.num_reg_images() >= _SMALLEST_MODEL and m.num_points3D()]
         if models:
@@ -307,18 +308,32 @@ def _map(
     return sorted(models, key=lambda model: -model.num_reg_images())
 
 
+def _count(advance: Callable[[], None], snapshots: Path) -> None:
+    """Count a photo that got a pose, and keep the largest snapshot alone: together they would take disk space
+    by the square of the photos."""
+    advance()
+    for smaller in _snapshots(snapshots)[1:]:
+        shutil.rmtree(smaller)
+
+
+def _snapshots(folder: Path) -> list[Path]:
+    """List the snapshots of mapping, the largest first."""
+    found = folder.glob("*/images.bin")
+    return [images.parent for images in sorted(found, key=lambda path: -path.stat().st_size)]
+
+
 def _largest_snapshot(snapshots: Path, database: Path) -> Path | None:
     """Find the largest snapshot of mapping that is whole and of the database's photos: COLMAP's library
     crashes on others."""
     pycolmap = load_pycolmap()
     with pycolmap.Database.open(database) as db:
         features = {i.image_id: db.num_keypoints_for_image(i.image_id) for i in db.read_all_images()}
-    for images in sorted(snapshots.glob("*/images.bin"), key=lambda path: -path.stat().st_size):
+    for snapshot in _snapshots(snapshots):
         with suppress(UserError, *DAMAGE):  # cut off when the computer stopped
-            read_model_files(images.parent)
-            found = pycolmap.Reconstruction(images.parent).images
+            read_model_files(snapshot)
+            found = pycolmap.Reconstruction(snapshot).images
             if all(features.get(number) == image.num_points2D() for number, image in found.items()):
-                return images.parent
+                return snapshot
     return None
 
 
