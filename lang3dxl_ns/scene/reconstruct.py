@@ -85,7 +85,7 @@ _STEPS, _REPEATED = 20, 2
 and 5 change no place, and for a thousand photos a step takes ten seconds."""
 _SAVED = 100
 """Photos that get a pose between two snapshots of mapping, from which a stopped one goes on."""
-_CORE_S, _CORE_S_MAPPED = 5.75, 0.01
+_CORE_S, _CORE_S_MAPPED = 6.6, 0.006
 """Seconds of a core for each photo, and for each with every other one in mapping."""
 _RELAXED = {"init_min_num_inliers": 30, "init_min_tri_angle": 4.0, "abs_pose_min_num_inliers": 15}
 """Thresholds of the incremental mapper where it finds no model with the usual ones."""
@@ -144,8 +144,8 @@ def reconstruct(
 
 def core_seconds(photos: int) -> float:
     """Estimate how long a core works on so many photos of 1,600 pixels with plain features. Features and
-    pairs grow with their number, and mapping with its square. Measured for 200, and for 1,000 until 451 had a
-    pose (docs/lab/reconstruction.md)."""
+    pairs grow with their number, and mapping with its square. Measured for 200 and 1,000
+    (docs/lab/reconstruction.md)."""
     return photos * (_CORE_S + photos * _CORE_S_MAPPED)
 
 
