@@ -144,8 +144,8 @@ def reconstruct(
 
 def core_seconds(photos: int) -> float:
     """Estimate how long a core works on so many photos of 1,600 pixels with plain features. Features and
-    pairs grow with their number, and mapping with its square. Measured for 200 and 1,000
-    (docs/lab/reconstruction.md)."""
+    pairs grow with their number, and mapping with its square. Measured for 200, and for
+    1,000 up to the last adjustment (docs/lab/reconstruction.md)."""
     return photos * (_CORE_S + photos * _CORE_S_MAPPED)
 
 
@@ -321,7 +321,7 @@ def _count(advance: Callable[[], None], snapshots: Path) -> None:
     by the square of the photos."""
     advance()
     for smaller in _snapshots(snapshots)[1:]:
-        shutil.rmtree(smaller)
+        shutil.rmtree(smaller, ignore_errors=True)
 
 
 def _snapshots(folder: Path) -> list[Path]:
@@ -342,6 +342,7 @@ def _largest_snapshot(snapshots: Path, database: Path) -> Path | None:
             found = pycolmap.Reconstruction(snapshot).images
             if all(features.get(number) == image.num_points2D() for number, image in found.items()):
                 return snapshot
+        shutil.rmtree(snapshot, ignore_errors=True)  # or `_count` would keep it in place of new ones
     return None
 
 
