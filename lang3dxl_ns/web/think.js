@@ -19,7 +19,7 @@ export async function fetched(name, about = null) {
 /** Start a worker; returns a function that gives it a job and resolves to the answer. told: called with the share of
  * the scene that has been read; failed: called if the worker can't run. */
 export function thinker(told, failed) {
-  const worker = new Worker("worker.js", { type: "module" }), waiting = new Map();
+  const worker = new Worker(new URL("worker.js", import.meta.url), { type: "module" }), waiting = new Map();
   worker.onmessage = ({ data: { id, output, error, done } }) => {
     if (done !== undefined) return told(done);
     const [resolve, reject] = waiting.get(id);

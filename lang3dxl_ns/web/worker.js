@@ -4,15 +4,19 @@ import { decodedRows, shippedRows } from "./decode.js";
 import { massOf, rankViews, readViews } from "./find.js";
 import { likeness } from "./like.js";
 import { bestPhoto, gaussiansAt, middleOf, unpackSplats } from "./pick.js";
+import { piecesIn, prepare } from "./pieces.js";
 import { freeSpace } from "./space.js";
-import { fetched } from "./think.js";
-import { areShown, isThere, thingsOf } from "./things.js";
+import { fetched, thinker } from "./think.js";
+import { areShown, isThere, sharpened, thingsOf } from "./things.js";
 import { ancestry, FAN } from "./tree.js";
 import { Vocabulary } from "./vocabulary.js";
 
 const EXAMPLE = 5; // number of Gaussians that represent a clicked place
 const INSIDE = 60; // Gaussians that represent an outlined place
+const HELPERS = 3; // most workers that find pieces beside this one
 let about, answers, vocabulary, geometry, views, mass, field;
+let shares; // of the views: { numbered, scene, think (if a helper holds it) }
+let held; // such a share, if this worker is a helper
 const parts = new Map(); // of the scene, by number: { geometry, opacities, floats, answers, root }; chunk 0 is the whole scene
 let limit = 255;
 
@@ -30,6 +34,28 @@ function judged([text, ...negatives], threshold) {
 
 /** Read rows of codes, or rows that were decoded beforehand. */
 const rowsOf = (buffer, count, tell) => (field ? decodedRows({ ...about.words, count }, buffer, field, tell) : shippedRows({ ...about.words, count }, buffer));
+
+/** Share the views with a helper for each core but one. */
+function shareViews() {
+  const { centers, axes, opacities } = geometry, cores = globalThis.Worker ? (navigator.hardwareConcurrency ?? 1) : 1;
+  const count = Math.min(1 + HELPERS, cores), scene = { centers, axes, opacities, antialiased: about.antialiased };
+  shares = Array.from({ length: count }, (_, k) => ({ scene, numbered: [...views.entries()].filter(([number]) => number % count === k) }));
+  prepare(shares[0].numbered, scene);
+  for (const own of shares.slice(1)) {
+    let helper;
+    const lost = new Promise((_, failed) => (helper = thinker(() => {}, failed)));
+    own.think = (job, input) => Promise.race([helper(job, input), lost]);
+    own.think("share", { scene, numbered: own.numbered }).catch(() => (own.think = null));
+  }
+}
+
+/** Find the pieces of heat in all views, in their order: the helpers in their shares, this worker in the rest. */
+async function piecesOfAll(heat) {
+  const here = ({ numbered, scene }) => piecesIn(numbered, scene, heat);
+  const beside = shares.map((own) => own.think?.("pieces", { heat }).catch(() => here(own)));
+  const found = await Promise.all(shares.map((own, k) => beside[k] ?? here(own)));
+  return found.flat().sort((one, other) => one.view - other.view);
+}
 
 // ── parts ──
 
@@ -87,6 +113,7 @@ const jobs = {
     }));
     mass = massOf(views, words.count);
     answers.foreground = about.foreground.length ? new Uint8Array(await bytes("foreground.bin")) : null;
+    shareViews();
     return vocabulary.listed;
   },
 
@@ -137,10 +164,20 @@ const jobs = {
     }
     if (!isThere(relevancy, about.words.rules)) return { things: [], candidates: [] };
     const better = (weighted) => prompt && answers.better(weighted, prompt);
-    const found = thingsOf(views, { ...geometry, mass, gap: about.words.gap, edges: about.edges, antialiased: about.antialiased }, relevancy, taught, better);
+    const scene = { ...geometry, mass, gap: about.words.gap, edges: about.edges };
+    const found = thingsOf(await piecesOfAll(sharpened(scene, relevancy)), views, scene, relevancy, taught, better);
     const placed = (thing) => ({ ...thing, center: inWorld(thing.center) });
     return { ...found, things: found.things.map(placed), candidates: found.candidates.map(placed) };
   },
+
+  /** Hold a share of the views, as a helper. */
+  share(given) {
+    held = given;
+    prepare(held.numbered, held.scene);
+    return {};
+  },
+
+  pieces: ({ heat }) => piecesIn(held.numbered, held.scene, heat),
 
   /** Tell for each list of things, by their rows, which ones a view shows. */
   shown: ({ camera, lists }) => lists.map((things) => areShown(things, camera, geometry.centers, hitsAt, (id) => gaussian(id).root)),

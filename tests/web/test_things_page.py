@@ -207,7 +207,7 @@ def test_a_map_falls_into_the_pieces_of_python(page):
     labels, count = split(heat)
     assert count > 4
     body = "return [...m.split(Float32Array.from(given), 60, 40).labels];"
-    found = module(page, "things", body, heat.ravel().tolist())
+    found = module(page, "pieces", body, heat.ravel().tolist())
     np.testing.assert_array_equal(numbered(found), numbered(labels.ravel()))  # in whatever order
 
 
@@ -235,7 +235,7 @@ def test_a_view_is_drawn_as_python_renders_it(page, antialiased):
       m.drawn(view, scene, heat.map((value) => 1 - value)); // of another word: its projection is kept
       const { map, depth, surface } = m.drawn(view, scene, heat);
       return [map, depth, surface].map((one) => [...one]);"""
-    drawn = np.array(module(page, "things", body, given)).reshape(3, 60, 80)
+    drawn = np.array(module(page, "pieces", body, given)).reshape(3, 60, 80)
     where = map.numpy() > LEVELS[0]  # what no piece holds need not be drawn
     assert 0.05 < where.mean() < 0.9
     for found, expected in zip(drawn, (map, hot / map, seen / cover), strict=True):
@@ -434,6 +434,54 @@ def test_boxes_are_those_of_python(page):
         found = module(page, "things", body, given)
         for name, expected in (("center", center), ("axes", axes), ("size", size)):
             np.testing.assert_allclose(found[name], expected, atol=1e-6)
+
+
+SHARED = """async ([cores, lost]) => {
+  const start = `Object.defineProperty(navigator, "hardwareConcurrency", { value: ${cores} });
+    const Own = Worker;
+    let helpers = 0;
+    self.Worker = class {
+      constructor(...given) {
+        helpers++;
+        if (!${lost}) return new Own(...given);
+        setTimeout(() => this.onerror());
+      }
+      postMessage() {}
+    };
+    addEventListener("message", ({ data }) => data === "helpers" && postMessage({ output: helpers }));
+    await import("${location.origin}/worker.js");
+    postMessage({ output: "ready" });`;
+  const worker = new Worker(URL.createObjectURL(new Blob([start], { type: "text/javascript" })), { type: "module" });
+  const next = () => new Promise((resolve, reject) => {
+    worker.onerror = reject;
+    worker.onmessage = ({ data }) => (data.error ? reject(data.error) : data.output && resolve(data.output));
+  });
+  const think = (message) => (worker.postMessage(message), next());
+  await next();
+  const read = async (name) => (await fetch(name)).arrayBuffer();
+  const about = JSON.parse(new TextDecoder().decode(await read("scene.json")));
+  about.files = Object.fromEntries(Object.entries(about.files).map(([name, own]) => [name, `${location.origin}/${own}`]));
+  await think({ id: 1, job: "load", input: { description: about, splats: await read(about.files["splats.bin"]) } });
+  const given = { text: "windows", negatives: [] };
+  const { relevancy } = await think({ id: 1, job: "ask", input: given });
+  const answers = [];
+  for (let n = 0; n < 2; n++) answers.push(await think({ id: 1, job: "things", input: { ...given, relevancy } }));
+  const helpers = await new Promise((resolve) => {
+    worker.onmessage = ({ data }) => resolve(data.output);
+    worker.postMessage("helpers");
+  });
+  worker.terminate();
+  return [helpers, ...answers.map((one) => JSON.stringify(one, (_, value) => (ArrayBuffer.isView(value) ? [...value] : value)))];
+}"""  # noqa: E501
+"""Things of a word, twice, on so many cores, with helpers that can't start if lost."""
+
+
+def test_things_are_the_same_however_many_workers_look_for_them(page):
+    alone, *answers = page.evaluate(SHARED, [1, False])
+    assert alone == 0 and '"things":[{' in answers[0] and answers[0] == answers[1]
+    assert page.evaluate(SHARED, [2, False]) == [1, *answers]
+    assert page.evaluate(SHARED, [64, False]) == [3, *answers]
+    assert page.evaluate(SHARED, [64, True]) == [3, *answers]
 
 
 def test_a_word_lists_its_things_and_one_can_be_chosen_hidden_and_linked(page):
