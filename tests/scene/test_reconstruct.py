@@ -367,6 +367,19 @@ def test_stopped_mapping_goes_on_from_its_last_snapshot(photos, scene, monkeypat
     assert distances.max() < 0.15
 
 
+def test_a_snapshot_that_cannot_be_used_gives_way_to_smaller_ones(photos, monkeypatch):
+    snapshots, left = photos / "lang3dxl_cache" / "reconstruction" / "snapshots", set()
+    for _ in range(2):
+        stop_mapping(monkeypatch, 3)
+        with pytest.raises(KeyboardInterrupt):
+            reconstruct_scene(photos, None, SIFT)
+        (last,) = snapshots.iterdir()
+        left.add(last.name)
+        with (last / "images.bin").open("ab") as file:
+            file.write(bytes(10**6))  # it is the largest now
+    assert len(left) == 2
+
+
 def matched_with(database):
     """Features of each photo, and the pairs with verified matches."""
     with pycolmap.Database.open(database) as db:
