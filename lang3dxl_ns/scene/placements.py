@@ -6,16 +6,19 @@ neighbors: the rotation between two photos, measured from their matches alone, t
 
 from __future__ import annotations
 
+import os
 from collections import Counter
 from collections.abc import Iterable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from numpy import ndarray as Array
 from scipy.spatial.transform import Rotation
 
+from lang3dxl_ns.common.console import tracked
 from lang3dxl_ns.scene.colmap import load_pycolmap
 from lang3dxl_ns.scene.reconstruction import CONTRADICTED, LONELY
 
@@ -79,21 +82,27 @@ def matched_pairs(database: pycolmap.Database, cameras: Mapping[int, pycolmap.Ca
     them open where matches lie on one wall."""
     pycolmap = load_pycolmap()
     points = {number: database.read_keypoints(number)[:, :2].astype(float) for number in cameras}
-    found = []
-    for key, matches in zip(*database.read_two_view_geometry_num_inliers(), strict=True):
-        first, second = pycolmap.pair_id_to_image_pair(key)
-        if matches < LEAST_MATCHES or first not in cameras or second not in cameras:
-            continue
-        ends = np.asarray(database.read_two_view_geometry(first, second).inlier_matches)
+
+    def measured(pair: tuple[int, int, Int[Array, "m 2"]]) -> MatchedPair | None:
+        first, second, ends = pair
         pixels = points[first][ends[:, 0]], points[second][ends[:, 1]]
         seen_by = cameras[first], cameras[second]
         error = _ERROR * max(max(camera.width, camera.height) for camera in seen_by)
         ransac = {"max_error": error, "min_num_trials": 100, "random_seed": 0}
-        measured = pycolmap.estimate_essential_matrix(*pixels, *seen_by, ransac)
-        if measured and measured["num_inliers"] >= LEAST_MATCHES:
-            turn = measured["cam2_from_cam1"].rotation.matrix()
-            found.append(MatchedPair(first, second, measured["num_inliers"], turn))
-    return found
+        found = pycolmap.estimate_essential_matrix(*pixels, *seen_by, ransac)
+        if not found or found["num_inliers"] < LEAST_MATCHES:
+            return None
+        return MatchedPair(first, second, found["num_inliers"], found["cam2_from_cam1"].rotation.matrix())
+
+    matched = []
+    for key, count in zip(*database.read_two_view_geometry_num_inliers(), strict=True):
+        first, second = pycolmap.pair_id_to_image_pair(key)
+        if count >= LEAST_MATCHES and first in cameras and second in cameras:
+            ends = np.asarray(database.read_two_view_geometry(first, second).inlier_matches)
+            matched.append((first, second, ends))
+    with ThreadPoolExecutor(os.cpu_count()) as cores:  # COLMAP's library lets others go on meanwhile
+        found = tracked(cores.map(measured, matched), "pairs measured", len(matched))
+        return [pair for pair in found if pair]
 
 
 def cameras_of(model: pycolmap.Reconstruction) -> dict[int, pycolmap.Camera]:
