@@ -144,8 +144,8 @@ def reconstruct(
 
 def core_seconds(photos: int) -> float:
     """Estimate how long a core works on so many photos of 1,600 pixels with plain features. Features and
-    pairs grow with their number, and mapping with its square. Measured for 200, and for
-    1,000 up to the last adjustment (docs/lab/reconstruction.md)."""
+    pairs grow with their number, and mapping with its square. Measured for 200 and 1,000
+    (docs/lab/reconstruction.md)."""
     return photos * (_CORE_S + photos * _CORE_S_MAPPED)
 
 
