@@ -6,11 +6,10 @@ neighbors: the rotation between two photos, measured from their matches alone, t
 
 from __future__ import annotations
 
-import os
 from collections import Counter
 from collections.abc import Iterable, Mapping
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from multiprocessing.pool import ThreadPool
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -100,9 +99,10 @@ def matched_pairs(database: pycolmap.Database, cameras: Mapping[int, pycolmap.Ca
         if count >= LEAST_MATCHES and first in cameras and second in cameras:
             ends = np.asarray(database.read_two_view_geometry(first, second).inlier_matches)
             matched.append((first, second, ends))
-    with ThreadPoolExecutor(os.cpu_count()) as cores:  # COLMAP's library lets others go on meanwhile
-        found = tracked(cores.map(measured, matched), "pairs measured", len(matched))
-        return [pair for pair in found if pair]
+    with (
+        ThreadPool() as cores
+    ):  # COLMAP's library lets others go on meanwhile; Ctrl+C waits for no other pair
+        return [pair for pair in tracked(cores.imap(measured, matched), "pairs measured", len(matched)) if pair]
 
 
 def cameras_of(model: pycolmap.Reconstruction) -> dict[int, pycolmap.Camera]:

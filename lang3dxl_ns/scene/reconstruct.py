@@ -203,7 +203,7 @@ def _mapping(
         database = feature_database(photos, copies, work, settings)
         extract(database, copies, settings)
     with timed(spent, "matching"):
-        if not _snapshots(work / SNAPSHOTS):  # mapping began: all pairs are there
+        if not _snapshots(work / SNAPSHOTS):  # or mapping has begun, with all pairs
             match(database, copies, settings)
     with timed(spent, "mapping"):
         models = _map(database, copies, work, settings.mapper)

@@ -18,11 +18,12 @@ const FALLOFF = Float64Array.from({ length: 12 * FINE }, (_, k) => Math.exp(-k /
  * antialiased }, in the views' frame. */
 export const piecesIn = (views, scene, heat) => views.flatMap(([number, view]) => piecesOf(drawn(view, scene, heat), number));
 
-/** Project views that are kept, between other jobs: the first word then doesn't wait for it. */
+/** Project views between other jobs, until no more are kept: the first word then doesn't wait for it. */
 export async function prepare(views, scene) {
   for (const [, view] of views) {
     await new Promise((go) => setTimeout(go));
-    if (kept < MOST_KEPT) projected(view, scene);
+    projected(view, scene);
+    if (!projections.has(view)) return;
   }
 }
 

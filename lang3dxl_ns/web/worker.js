@@ -44,7 +44,7 @@ function shareViews() {
   for (const own of shares.slice(1)) {
     let helper;
     const lost = new Promise((_, failed) => (helper = thinker(() => {}, failed)));
-    own.think = (job, input) => Promise.race([helper(job, input), lost]);
+    own.think = async (job, input) => Promise.race([lost, helper(job, input)]);
     own.think("share", { scene, numbered: own.numbered }).catch(() => (own.think = null));
   }
 }

@@ -3,6 +3,8 @@
 import os
 import pickle
 import shutil
+import time
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -16,7 +18,7 @@ from lang3dxl_ns.commands.prepare import Reconstruct
 from lang3dxl_ns.common import parallel
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.files import locked
-from lang3dxl_ns.scene import matching, pairing
+from lang3dxl_ns.scene import matching, pairing, placements
 from lang3dxl_ns.scene import reconstruct as module
 from lang3dxl_ns.scene.colmap import read_reconstruction
 from lang3dxl_ns.scene.matching import numbered
@@ -155,6 +157,26 @@ def test_what_matches_measure_agrees_with_the_model(reconstructed):
     assert doubtful_placements(rotations, pairs) == {
         1: "most of its matches are with photos placed elsewhere"
     }
+
+
+def test_measuring_what_matches_waits_for_no_other_pair_when_stopped(reconstructed, monkeypatch):
+    """A thousand photos have 38,000 pairs, which take minutes."""
+    data, model, _ = reconstructed
+    database, asked = data / "lang3dxl_cache/reconstruction/database.db", []
+
+    def slow(*_):
+        asked.append(time.sleep(0.1))
+
+    def stopped(items, *_):
+        yield next(items)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(pycolmap, "estimate_essential_matrix", slow)
+    monkeypatch.setattr(placements, "ThreadPool", partial(placements.ThreadPool, 2))
+    monkeypatch.setattr(placements, "tracked", stopped)
+    with pycolmap.Database.open(database) as db, pytest.raises(KeyboardInterrupt):
+        matched_pairs(db, cameras_of(pycolmap.Reconstruction(model)))
+    assert len(asked) <= 4  # of at least seven
 
 
 @pytest.mark.parametrize(("kind", "points"), [("xfeat", [15, 30]), ("sift", [15, 30]), ("dsp-sift", [15])])
