@@ -102,7 +102,7 @@ def matched_pairs(database: pycolmap.Database, cameras: Mapping[int, pycolmap.Ca
     with (
         ThreadPool() as cores
     ):  # COLMAP's library lets others go on meanwhile; Ctrl+C waits for no other pair
-        return [pair for pair in tracked(cores.imap(measured, matched), "pairs measured", len(matched)) if pair]
+        return [*filter(None, tracked(cores.imap(measured, matched), "pairs measured", len(matched)))]
 
 
 def cameras_of(model: pycolmap.Reconstruction) -> dict[int, pycolmap.Camera]:
