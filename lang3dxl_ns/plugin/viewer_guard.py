@@ -2,7 +2,9 @@
 
 viser 0.2.7 serves any file of the machine, to pages of any origin, and has no option for either; and it
 counts a client whose message it can't read forever. So `guard_viewers` puts a check before every request and
-message to the servers that this process starts. docs/troubleshooting.md lists what it allows.
+message to the servers that this process starts. docs/troubleshooting.md lists what it allows. Nor does viser
+build its page anew here: the one of its wheel is complete, and looking whether it is being built reads every
+process of the machine, which fails when one of them ends meanwhile.
 """
 
 from __future__ import annotations
@@ -15,7 +17,7 @@ from typing import Any
 import viser.infra._infra as infra
 import websockets.server
 from nerfstudio.configs.base_config import ViewerConfig
-from viser import _messages
+from viser import _client_autobuild, _messages
 
 from lang3dxl_ns.common.checks import check_address
 from lang3dxl_ns.common.console import say
@@ -67,6 +69,8 @@ def guard_viewers() -> None:
             await websocket.close(1007)
             await websocket.recv()  # raises what viser takes for the end of a connection
 
+    if (_client_autobuild.build_dir / "index.html").exists():
+        _client_autobuild.ensure_client_is_built = lambda: None
     guarded_serve.is_guarded = True  # type: ignore[attr-defined]
     module.serve = guarded_serve
     infra._message_consumer = guarded_consume  # type: ignore[assignment]

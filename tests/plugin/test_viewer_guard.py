@@ -2,9 +2,11 @@
 
 import math
 import socket
+import subprocess
 import time
 
 import msgspec
+import psutil
 import pytest
 import viser
 from raw_http import get, reply
@@ -50,6 +52,17 @@ def test_it_listens_on_this_machine_alone_and_says_so(viewer, capsys):
     assert server.get_port() != viewer.port
     server.stop()
     assert ONLY_HERE.split(":")[0] in " ".join(capsys.readouterr().out.split())
+
+
+def test_its_page_is_not_built_anew_whatever_the_machine_does_meanwhile(viewer, monkeypatch):
+    monkeypatch.setattr(subprocess, "run", fail)  # viser downloads Node for its page when files look newer
+    monkeypatch.setattr(psutil, "process_iter", fail)  # and raises when a process ends while it looks at all
+    server = viser.ViserServer(host="127.0.0.1", port=viewer.port, verbose=False)
+    server.stop()
+
+
+def fail(*_args, **_options):
+    raise AssertionError("viser looks at the machine")
 
 
 @pytest.mark.parametrize(
