@@ -36,7 +36,7 @@ class ListThings(OfScene):
         from lang3dxl_ns.files.coco import check_labels_file
         from lang3dxl_ns.open_scene import load_scene
         from lang3dxl_ns.query.ask import prompts_of
-        from lang3dxl_ns.query.text import Prompt, caution
+        from lang3dxl_ns.query.text import Prompt
         from lang3dxl_ns.things.grammar import Request, answered, facing, meant, parse
         from lang3dxl_ns.things.write import each_word_once, table, write_catalog, write_picture, write_things
 
@@ -63,10 +63,8 @@ class ListThings(OfScene):
         by_word = {p.text: one for p, one in zip(prompts, answers, strict=True) if not p.negatives}
         for prompt, one in zip(prompts, answers, strict=True):
             say(f"{one.word}: {one.count}" + (f" ({one.caution})" if one.caution else ""))
-            if prompt.taught is None:
-                other = meant(prompt.text, scene.words)
-                advice = caution(prompt.text, counted=True), other and f"did you mean {other}?"
-                say(*(f"  {line}" for line in advice if line))
+            if prompt.taught is None and (other := meant(prompt.text, scene.words)):
+                say(f"  did you mean {other}?")
         named = each_word_once(answers[: len(own)])
         if any(one.things for one in named):
             say(*table(scene, named))

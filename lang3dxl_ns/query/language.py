@@ -40,8 +40,8 @@ class Meaning:
 
 def held(typed: str, names: Iterable[str] = ()) -> tuple[str, Callable[[str], str]]:
     """Put a placeholder, which is one word, in place of every part that quotes hold, and of `names`, such as
-    *lords and ladies*. Return the text with single spaces, and a function that puts the parts back, without
-    quotes."""
+    *lords and ladies*. Return the text with single spaces and without *please*, and a function that puts
+    the parts back, without quotes."""
     parts: list[str] = []
 
     def hold(found: re.Match[str]) -> str:
@@ -55,7 +55,8 @@ def held(typed: str, names: Iterable[str] = ()) -> tuple[str, Callable[[str], st
     phrases = (*TABLE["one"], *filter(None, map(tidy, names)))
     whole = re.compile(rf'"[^"]*"|{_words(phrases).pattern}', re.IGNORECASE)
     # Single spaces, since runs of them would take patterns a time that grows with their square.
-    return whole.sub(hold, " ".join(text.split())), restored
+    polite = re.compile(rf"(?:^|,? )(?:{_any('polite')})(?![\w-]),?", re.IGNORECASE)
+    return polite.sub("", whole.sub(hold, " ".join(text.split()))).strip(), restored
 
 
 def tidy(text: str) -> str:
@@ -114,12 +115,12 @@ def meaning(text: str) -> Meaning:
         return Meaning(text)
     unused: list[tuple[str, str]] = []
     text = " ".join(text.split())  # as in `held`
-    target = text.rstrip(" ?!.") or text
-    asks = re.compile(rf"^(?:{_any('lead')}|{_any('count')})\s+(?=\S)", re.IGNORECASE)
-    if (found := asks.match(target)) is not None:
-        if re.fullmatch(rf"(?:{_any('count')})\s+", found[0], re.IGNORECASE):
-            unused.append(("count", found[0].strip()))
-        target = re.sub(r"\s+(?:are|is)(?:\s+there)?$", "", target[found.end() :])
+    target = text.strip(TABLE["ends"]) or text
+    asks = re.compile(rf"^(?:(?:{_any('lead')})\s+)?((?:{_any('count')})\s+)?(?=\S)", re.IGNORECASE)
+    if (found := asks.match(target)) is not None and found[0]:
+        if found[1]:
+            unused.append(("count", found[1].strip()))
+        target = re.sub(r"(?:\s+there)?\s+(?:are|is)(?:\s+there)?$", "", target[found.end() :])
     if (found := re.match(rf"^(?:{_any('no')})\s+(?=\S)", target, re.IGNORECASE)) is not None:
         unused.append(("no", found[0].strip()))
         target = target[found.end() :]

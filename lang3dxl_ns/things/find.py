@@ -18,7 +18,7 @@ from lang3dxl_ns.query.answering import Answering
 from lang3dxl_ns.query.doubt import peaks
 from lang3dxl_ns.query.negatives import singulars
 from lang3dxl_ns.query.question import Question
-from lang3dxl_ns.query.text import Prompt
+from lang3dxl_ns.query.text import Prompt, caution
 from lang3dxl_ns.query.trust import FAR
 from lang3dxl_ns.query.vocabulary import searched, shipped_vocabulary, singular
 from lang3dxl_ns.rendering import composite, harmonics_of
@@ -130,14 +130,14 @@ def things_of(scene: Answering, question: Question) -> list[Things]:
             [_thing(prompt.name, one, boxed(one), mass, values) for one in some] for some in (sure, rest)
         )
         trust, far = question.trusts[i], (scene.foreignness or 0) >= FAR and prompt.taught is None
-        caution = trust.reason if far or trust.level != "sure" else None
+        told = [trust.reason, trust.remedy] if far or trust.level != "sure" else []
         if better and not things:
-            caution = f"what was found fits {next(iter(better.values()))!r} better"
+            told = [f"what was found fits {next(iter(better.values()))!r} better"]
         if shown_in < VIEWS:
-            caution = (
-                f"{'one' if shown_in else 'no'} training photo shows the scene, and a thing is what two show"
-            )
-        answers.append(Things(prompt.name, things, candidates, caution))
+            shows = "one training photo shows" if shown_in else "no training photo shows"
+            told = [f"{shows} the scene, and a thing is what two show"]
+        told += [] if prompt.taught else [caution(prompt.text, counted=True) or ""]
+        answers.append(Things(prompt.name, things, candidates, "; ".join(filter(None, told)) or None))
     return answers
 
 

@@ -135,16 +135,19 @@ def parse(text: str, names: Iterable[str] = ()) -> Request:
     names the part, for what the grammar doesn't know."""
     words = table()
     rest, restored = held(text, names)
-    rest = " ".join(rest.lower().strip(" ?!.").split())
+    rest = " ".join(rest.lower().strip(TABLE["ends"]).split())
     if len(rest) > words["longest"]:
         raise UserError(
             f"this question has {len(rest):,} letters: ask for one thing, in {words['longest']} at most"
         )
+    same = rf"(?<![\w-])(?:{_any(words['same'])})(?![\w-])"
+    rest = re.sub(same, lambda found: words["same"][found[0]], rest)
     rest = re.sub(rf"(?<=st|nd|rd|th)-(?=(?:{_any(words['superlatives'])}) )", " ", rest)  # second-highest
     asked = _plain(re.sub(rf"^(?:{_any(TABLE['lead'])})\s+", "", rest))
     rest = re.sub(rf"^(?:{_any(TABLE['count'])})\s+", "", asked)
     relation, tail = _any(words["relations"]), _any(words["tail"])
-    idle = rf" (?:that |which )?(?:are|is)(?: there)?(?= (?:{relation}) )| (?:{tail})$"
+    idle = rf"^(?:which|what) (?=.+ (?:are|is|{tail}) (?:{relation}) )|,? (?:{tail})$"
+    idle += rf"| (?:(?:that |which )?(?:are|is)|{tail})(?= (?:{relation}) )"
     try:
         return replace(_request(re.sub(idle, "", rest), restored), count=rest != asked)
     except UserError as error:
@@ -179,7 +182,7 @@ def _request(rest: str, restored: Callable[[str], str]) -> Request:
     if noun and (first in words["ordinals"] or re.fullmatch(r"[1-9]\d*(st|nd|rd|th)", first)):
         nth, rest = words["ordinals"].get(first) or int(first[:-2]), noun
     place, (first, _, noun) = first, rest.partition(" ")
-    if noun and first in words["superlatives"] and not noun.startswith("of "):
+    if noun and first in words["superlatives"] and not re.match(r"of\b", noun):
         superlative, rest = first, noun
     for name in (rest, *([] if without is None else [without])):
         _check_name(restored(name) and name)  # quotes may hold nothing
@@ -197,7 +200,8 @@ def _check_name(name: str) -> None:
     if not name:
         raise UserError("this names no thing: ask for one, such as how many windows")
     kinds = ("asks", "unknown", "ordinals", "superlatives", "from", "relations")
-    parts = rf"(?<![\w-])(?:{_any(word for kind in kinds for word in words[kind])}|\d\w*)(?![\w-])|[,;]"
+    unknown = _any(word for kind in kinds for word in words[kind])
+    parts = rf"(?<![\w-])(?:{unknown}|\d\w*)(?![\w-])|[,;]|['’]s(?!\w)"
     if unused := re.findall(parts, re.sub(f"{HELD}.*?{HELD}", "", name)):
         told = f"{name}: a question can't use {', '.join(dict.fromkeys(unused))} here; ask how many windows, "
         told += "for the highest tower, the third window from the left, or windows above the portal; "
@@ -217,7 +221,11 @@ def answer(request: Request, found: Sequence[Things], sight: Facing) -> list[Thi
     if request.relation:
         others = [answer(other, found, sight) for other in request.others]
         if missing := [other.word for other, there in zip(request.others, others, strict=True) if not there]:
-            raise UserError(f"no {missing[0]} found: a relation to it has no answer")
+            raise UserError(
+                f"no {missing[0]} found, to which a relation has an answer: leave it out, or teach the word"
+            )
+        if request.relation == "between" and len({thing.id for listed in others for thing in listed}) < 2:
+            raise UserError(f"{request.others[0].word}: only one found, and between needs two")
         chosen = [t for t in chosen if _related(t, request.relation, others, view)]
     kind, sign = request.order
     if not sign:
@@ -359,7 +367,7 @@ def _between(thing: Thing, a: Thing, b: Thing) -> bool:
 
 
 def _plain(text: str) -> str:
-    return re.sub(rf"^(?:(?:{_any(TABLE['articles'])})\s+)+", "", text.strip())
+    return re.sub(rf"^(?:(?:{_any(TABLE['articles'])})(?:\s+|$))+", "", text.strip())
 
 
 def _any(phrases: Iterable[str]) -> str:

@@ -6,7 +6,7 @@ import { held, HELD } from "./vocabulary.js";
 const { grammar } = language, { BESIDE, INSIDE, CLOSE, VIEWS, SURE, MISSED } = language.things;
 const has = (table, word) => Object.hasOwn(table, word), listed = (phrases) => (Array.isArray(phrases) ? phrases : Object.keys(phrases));
 const any = (...kinds) => kinds.flatMap(listed).sort((a, b) => b.length - a.length).join("|");
-const plain = (text) => text.trim().replace(new RegExp(`^(?:(?:${any(language.articles)})\\s+)+`), "");
+const plain = (text) => text.trim().replace(new RegExp(`^(?:(?:${any(language.articles)})(?:\\s+|$))+`), "");
 
 /** Parse a question: { word, count, superlative, nth, along, relation, others: what it refers to, without }. Quotes hold
  * a phrase, and so do names, which were taught. Throws an error, which names the part, for what the grammar doesn't know. */
@@ -23,13 +23,15 @@ export function parse(text, names = []) {
 /** Cut off how a question begins and ends. */
 function opened(text, names) {
   const { text: typed, restored } = held(text, names);
-  let rest = typed.toLowerCase().replace(/^[ ?!.]+|[ ?!.]+$/g, "").split(/\s+/).filter(Boolean).join(" ");
+  const ends = `[${language.ends}]+`, relation = any(grammar.relations), tail = any(grammar.tail);
+  let rest = typed.toLowerCase().replace(new RegExp(`^${ends}|${ends}$`, "g"), "").split(/\s+/).filter(Boolean).join(" ");
+  rest = rest.replace(new RegExp(wholeWords(any(grammar.same)), "gu"), (word) => grammar.same[word]);
   const cut = (pattern) => rest !== (rest = rest.replace(pattern, ""));
   rest = rest.replace(new RegExp(`(?<=st|nd|rd|th)-(?=(?:${any(grammar.superlatives)}) )`, "g"), " "); // second-highest
   cut(new RegExp(`^(?:${any(language.lead)})\\s+`));
   rest = plain(rest);
   const count = cut(new RegExp(`^(?:${any(language.count)})\\s+`));
-  cut(new RegExp(` (?:that |which )?(?:are|is)(?: there)?(?= (?:${any(grammar.relations)}) )| (?:${any(grammar.tail)})$`, "g"));
+  cut(new RegExp(`^(?:which|what) (?=.+ (?:are|is|${tail}) (?:${relation}) )|,? (?:${tail})$| (?:(?:that |which )?(?:are|is)|${tail})(?= (?:${relation}) )`, "g"));
   return { rest, count, restored };
 }
 
@@ -48,7 +50,7 @@ function request(rest, restored) {
   rest = plain(rest);
   const [, place, ordered] = new RegExp(`^(${any(grammar.ordinals)}|[1-9]\\d*(?:st|nd|rd|th)) (.+)$`).exec(rest) ?? [];
   if (ordered) [asked.nth, rest] = [grammar.ordinals[place] ?? parseInt(place), ordered];
-  const [, superlative, noun] = new RegExp(`^(${any(grammar.superlatives)}) (?!of )(.+)$`).exec(rest) ?? [];
+  const [, superlative, noun] = new RegExp(`^(${any(grammar.superlatives)}) (?!of(?![\\p{L}\\p{N}_]))(.+)$`, "u").exec(rest) ?? [];
   if (noun) [asked.superlative, rest] = [superlative, noun];
   for (const name of [rest, ...(asked.without === null ? [] : [asked.without])]) checkName(restored(name) && name); // quotes may hold nothing
   if (asked.nth && !asked.along && !noun) throw new Error(`${place} ${rest}: say from which side, such as the ${place} ${rest} from the left`);
@@ -58,7 +60,7 @@ function request(rest, restored) {
 
 const KINDS = ["asks", "unknown", "ordinals", "superlatives", "from", "relations"].map((kind) => grammar[kind]);
 const wholeWords = (phrases) => `(?<![\\p{L}\\p{N}_-])(?:${phrases})(?![\\p{L}\\p{N}_-])`;
-const UNUSED = new RegExp(`${wholeWords(`${any(...KINDS)}|\\p{N}[\\p{L}\\p{N}_]*`)}|[,;]`, "gu");
+const UNUSED = new RegExp(`${wholeWords(`${any(...KINDS)}|\\p{Nd}[\\p{L}\\p{N}_]*`)}|[,;]|['’]s(?![\\p{L}\\p{N}_])`, "gu");
 
 function checkName(name) {
   if (!name) throw new Error("this names no thing: ask for one, such as how many windows");
@@ -69,7 +71,7 @@ function checkName(name) {
 }
 
 const PLACES = listed(grammar.superlatives).filter((word) => !has(grammar.from, word));
-const ASKS = new RegExp(`^(?:${any(grammar.ordinals)}|\\d+(?:st|nd|rd|th)) |${wholeWords(any(grammar.asks, PLACES))}`, "u");
+const ASKS = new RegExp(`^(?:${any(grammar.ordinals)}|\\d+(?:st|nd|rd|th)) |${wholeWords(any(grammar.asks, PLACES))}|${wholeWords(any(grammar.relations))}(?! (?:the )?${wholeWords(any(language.places))})`, "u");
 
 /** Whether what was typed asks more than where something is, perhaps with words that the grammar has no answer to. known:
  * phrases that hold such words and are none. */
@@ -96,7 +98,8 @@ export function answerTo(request, things, view) {
   if (without) chosen = chosen.filter(({ id }) => !things[without].some((other) => other.id === id));
   if (relation) {
     const there = others.map((other) => answerTo(other, things, view)), missing = there.findIndex((some) => !some.length);
-    if (missing >= 0) throw new Error(`no ${others[missing].word} found: a relation to it has no answer`);
+    if (missing >= 0) throw new Error(`no ${others[missing].word} found, to which a relation has an answer: leave it out, or teach the word`);
+    if (relation === "between" && new Set(there.flat().map(({ id }) => id)).size < 2) throw new Error(`${others[0].word}: only one found, and between needs two`);
     chosen = chosen.filter((thing) => related(thing, relation, there, view));
   }
   const [kind, sign] = orderOf(request), place = nth ?? 1;

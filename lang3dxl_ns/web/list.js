@@ -151,7 +151,7 @@ export class List extends EventTarget {
     Object.assign(first, { listed: true, asked: every ? null : new Set(chosen.map(({ id }) => id)) });
     const sure = asked.every(({ trust }) => trust.level === "sure" && !trust.far) ? "" : " Not sure: see the cards.";
     const doubt = counted ? null : unsure(request, found, view, shown), several = assumed(request, things, view, shown);
-    const note = [several && ` ${several}.`, doubt ? ` Unsure, since ${doubt}.` : "", sure, ...words.flatMap(advice).map((told) => ` But ${told}.`)].join("");
+    const note = [several && ` ${several}.`, doubt ? ` Unsure, since ${doubt}.` : "", sure, ...asked.filter(({ taught, examples }) => !taught && !examples).flatMap(({ text }) => advice(text)).map((told) => ` But ${told}.`)].join("");
     if (request.count) {
       this.dispatchEvent(new Event("change"));
       return `${shown(request.word)}: ${counted ? count(first.found) : chosen.length}.${note}`; // which suits one and many

@@ -16,18 +16,19 @@ const literal = (text) => text.replace(/[.*+?^${}()|[\]\\]/g, "\\$&");
 const L = "[\\p{L}\\p{N}_]";
 const wholeOf = (phrases) => new RegExp(`(?<!${L})(?:${longest(phrases)})(?!${L})`, "giu");
 const whole = (kind) => wholeOf(language[kind]);
-const leading = (kinds) => new RegExp(`^(?:${kinds.map(any).join("|")})\\s+(?=\\S)`, "iu");
+const leading = (kind) => new RegExp(`^(?:${any(kind)})\\s+(?=\\S)`, "iu");
 const WHERE = new RegExp(
   `\\s+(?:${any("before_places")})\\s+(?:the\\s+)?(?:${any("places")})(?!${L}).*$` +
   `|^(?:${any("places")}|${any("sizes")})\\s+(?!of(?!${L}))(?=\\S)|\\s+(?:${any("after")})$`, "giu"); // prettier-ignore
 
-/** Put a placeholder, which is one word, in place of every part that quotes hold, and of names: { text, restored: puts
+/** Put a placeholder, which is one word, in place of every part that quotes hold, and of names, and leave out *please*: { text, restored: puts
  * the parts back, without quotes }. */
 export function held(typed, names = []) {
   const parts = [], whole = wholeOf([...language.one, ...names.map(tidy).filter(Boolean)].map(literal)).source;
   const plain = typed.normalize("NFC").replace(/‘([^‘’]*)’|[“”„«»]/g, (_, quoted) => (quoted === undefined ? '"' : `"${quoted}"`));
   const text = plain.replaceAll(HELD, " ").replace(/[\0\s]+/g, " ").trim().replace(new RegExp(`"[^"]*"|${whole}`, "giu"), (part) => HELD + (parts.push(part) - 1) + HELD);
-  return { text, restored: (some) => tidy(some.replace(new RegExp(`${HELD}(\\d+)${HELD}`, "g"), (_, i) => parts[i])) };
+  const polite = new RegExp(`(?:^|,? )(?:${any("polite")})(?![\\p{L}\\p{N}_-]),?`, "giu");
+  return { text: text.replace(polite, "").trim(), restored: (some) => tidy(some.replace(new RegExp(`${HELD}(\\d+)${HELD}`, "g"), (_, i) => parts[i])) };
 }
 
 /** Parse prompts, each with negatives: `windows and doors; dome not roof`. Quotes and names are never split. */
@@ -49,22 +50,23 @@ export function parsePrompts(typed, names = []) {
 /** Find out what a prompt searches for, and which parts of it the answer does not use, as [kind, part]. */
 export function meaning(text) {
   if (/^(The )?[A-Z][\p{L}\p{N}_]* [A-Z][\p{L}\p{N}_]*/u.test(text) && english(text) === text) return { target: text, unused: [] };
-  const unused = [], counted = leading(["count"]).exec(text);
-  let target = text.replace(/[\s?!.]+$/, "") || text;
+  const unused = [], ends = `[\\s${language.ends}]+`;
+  let target = text.replace(new RegExp(`^${ends}|${ends}$`, "g"), "") || text;
   const cut = (pattern) => (target = target.replace(pattern, ""));
-  if (leading(["lead", "count"]).test(target)) {
-    if (counted) unused.push(["count", counted[0].trim()]);
-    cut(leading(["lead", "count"]));
-    cut(/\s+(?:are|is)(?:\s+there)?$/);
+  const [asks, counted] = new RegExp(`^(?:(?:${any("lead")})\\s+)?((?:${any("count")})\\s+)?(?=\\S)`, "iu").exec(target) ?? [""];
+  if (counted) unused.push(["count", counted.trim()]);
+  if (asks) {
+    target = target.slice(asks.length);
+    cut(/(?:\s+there)?\s+(?:are|is)(?:\s+there)?$/);
   }
-  const without = leading(["no"]).exec(target);
-  if (without) unused.push(["no", without[0].trim()]), cut(leading(["no"]));
-  cut(leading(["articles"]));
+  const without = leading("no").exec(target);
+  if (without) unused.push(["no", without[0].trim()]), cut(leading("no"));
+  cut(leading("articles"));
   const places = target.match(WHERE);
   if (places) {
     unused.push(["place", places.map((part) => part.trim()).join(" ")]);
     target = target.replace(WHERE, "").trim();
-    cut(leading(["articles"]));
+    cut(leading("articles"));
   }
   target = english(target.trim() || text);
   const color = new RegExp(`(?<!${L})(?:${any("colors")})(?=\\s+\\S)`, "iu").exec(target);

@@ -49,7 +49,7 @@ def test_a_question_without_an_answer_does_not_end_those_that_have_one(ask, tmp_
     )
     assert count == f"Wrote the things to {tmp_path}" and (tmp_path / "things.json").exists()
     assert near.startswith("windows near the dome: a question can't use near")
-    assert gate == "windows above the gate: no gate found: a relation to it has no answer"
+    assert gate.startswith("windows above the gate: no gate found, ")
     assert "windows above the gate" in ask("windows above the gate", text=["windows"])[-1]
     with pytest.raises(UserError, match="no gate found"):
         ask("windows above the gate")

@@ -11,6 +11,7 @@ from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.scene.georeference import Georeference
 from lang3dxl_ns.things.find import Things, is_upright
 from lang3dxl_ns.things.grammar import Request, Sight, answer, assumed, meant, parse, sight_of, table, unsure
+from lang3dxl_ns.words.taught_words import Example
 
 
 @pytest.mark.parametrize(
@@ -51,6 +52,18 @@ from lang3dxl_ns.things.grammar import Request, Sight, answer, assumed, meant, p
             Request("windows", True, relation="above", others=(Request("dome"),)),
         ),
         ("3rd window from left", Request("window", nth=3, along="left")),
+        ("Could you please tell me how many windows there are…", Request("windows", count=True)),
+        ("what is the total number of windows in the scene?", Request("windows", count=True)),
+        ("take me to the tallest tower of all", Request("tower", superlative="tallest")),
+        ("count all of the windows in total, please!", Request("windows", count=True)),
+        ("¿what’s the topmost window？", Request("window", superlative="highest")),
+        ("third window from the left side", Request("window", nth=3, along="left")),
+        (
+            "which windows can you see on the left side of the portal",
+            Request("windows", relation="left", others=(Request("portal"),)),
+        ),
+        ("windows beneath the left-hand tower",
+         Request("windows", relation="below", others=(Request("tower", superlative="left"),))),
         ('how many "Statue on the roof"', Request("Statue on the roof", count=True)),
         ("how many “doors and gates” not 'a' door", Request("doors and gates", True, without="'a' door")),
         ('"top" windows above the "left gate"',
@@ -76,9 +89,22 @@ def test_taught_names_and_quotes_hold_a_phrase(typed):
         *("third window", "windows from the left", "windows between the a and b and c", ""),
         *("left of the door", "windows on the second tower", "windows on"),
         *("tallest two towers", "top window", "gate 3", "0th window from the left", "doors, towers"),
-        *("third window from the left side", "windows; doors", "two windows above the portal"),
+        *(
+            "third window from the left part",
+            "windows; doors",
+            "left of",
+            "windows between the",
+            "two windows above the portal",
+        ),
         *("second highest tower from the left", "windows on the right", "leftmost window from the right"),
-        *("windows directly above the dome", 'how many ""', 'windows above ""', 'windows not " "'),
+        *("windows of the tower", "tallest tower's windows", "windows among the towers", "oldest tower"),
+        *(
+            "windows on the left side",
+            "windows directly above the dome",
+            'how many ""',
+            'windows above ""',
+            'windows not " "',
+        ),
     ],
 )
 def test_what_the_grammar_does_not_know_is_said(text):
@@ -97,7 +123,7 @@ def test_advice_is_a_sentence_whatever_was_typed():
         == "windows on the right: say which one, such as the second from the right"
     )
     assert said("3rd window").endswith("such as the 3rd window from the left")
-    assert "can't use from, left" in said("3rd window from the left side")
+    assert "can't use from, left" in said("3rd window from the left part")
     assert said('windows near the "left gate"').startswith(
         "windows near the left gate: a question can't use near"
     )
@@ -230,6 +256,8 @@ def test_a_relation_to_several_things_tells_that_any_counts():
     assert told("window left of the leftmost gate") == told("leftmost window") == ""
     assert told("window between the gates", [found[0], Things("gates", gates)]) != ""
     assert told("window between the gates", [found[0], Things("gates", gates[:2])]) == ""
+    with pytest.raises(UserError, match="gates: only one found"):
+        answer(parse("window between the gates"), [found[0], Things("gates", gates[:1])], lambda _: SIGHT)
 
 
 def test_a_scene_answers_with_text_things_and_caution():
@@ -242,6 +270,10 @@ def test_a_scene_answers_with_text_things_and_caution():
     assert left.text == f"1 found: id {found.id} in {found.best_photo}"
     assert str(left) == f"{left.text} ({left.caution})" and "unsure" in left.caution
     assert "flamingo: " in scene.answer("how many flamingo").caution  # the word itself is doubted
+    assert "did you mean windows?" in scene.answer("how many windwos").caution
+    assert "sizes are not told apart" in scene.answer("how many big windows").caution
+    taught = scene.teach("big window", Example("all/0003.jpg", points=((69, 69),)))
+    assert "not told apart" not in str(taught.answer("big window"))  # a name, in which big says no size
     with pytest.raises(UserError, match="only 2 found in this view"):
         scene.answer("third window from the left", view=scene.overview.name)
     with pytest.raises(UserError, match=r"absent\.jpg"):
