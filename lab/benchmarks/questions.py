@@ -131,7 +131,7 @@ def _outcome(
     asked, found = known[request.word], [one.found for one in known.values()]
     given = _answer(request, found, view)
     caution = given is None or any(known[word].found.caution for word in request.words)
-    doubt = unsure(request, found, lambda _: view) is not None
+    doubt = unsure(request, found, view) is not None
     true = _answer(request, [one.true_ones for one in known.values()], view)
     if request.count:  # of one word, perhaps without those of another one: always answered
         least, most = asked.found.least, asked.found.most
@@ -145,7 +145,7 @@ def _outcome(
 
 def _answer(request: Request, things: list[Things], view: Sight) -> list[Thing] | None:
     try:
-        return answer(request, things, lambda _: view)
+        return answer(request, things, view)
     except UserError:
         return None
 

@@ -68,11 +68,11 @@ class ListThings(OfScene):
         named = each_word_once(answers[: len(own)])
         if any(one.things for one in named):
             say(*table(scene, named))
-        sight = facing(scene, answers, self.view)
         for text, request in requests.items():
             try:
                 found = [by_word[word] for word in request.words]
-                say(f"{text}: {answered(request, found, sight)}")
+                view = facing(scene, request, found, self.view)
+                say(f"{text}: {answered(request, found, view)}")
             except UserError as error:
                 refused.append(_refusal(text, error))
         if self.out is not None and answers:

@@ -7,7 +7,7 @@ import re
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cache, partial
+from functools import cache
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -90,6 +90,8 @@ class Sight:
     """Ids of the things that one sees: the order from left to right is theirs; None: all."""
     upright: bool = True
     """Whether the photos tell which way is up."""
+    photo: str = ""
+    """Name of the photo that has these directions."""
 
 
 def best_photo(scene: Answering, things: Sequence[Thing]) -> ScenePhoto:
@@ -108,7 +110,7 @@ def sight_of(scene: Answering, things: list[Thing], photo: str | None = None) ->
     right = max((x - up * (x @ up), np.cross(up, back)), key=np.linalg.norm)
     right = right / max(np.linalg.norm(right), 1e-9)
     seen = None if photo is None else _shown(scene, taken, things)
-    return Sight(right, up, np.cross(up, right), seen, is_upright(scene))
+    return Sight(right, up, np.cross(up, right), seen, is_upright(scene), taken.name)
 
 
 def _shown(scene: Answering, photo: ScenePhoto, things: list[Thing]) -> frozenset[int]:
@@ -118,16 +120,12 @@ def _shown(scene: Answering, photo: ScenePhoto, things: list[Thing]) -> frozense
     return frozenset(thing.id for found in seen for _, thing, _ in found)
 
 
-Facing = Callable[[list[Thing]], Sight]
-"""Returns the directions in which some things are seen."""
-
-
-def facing(scene: Answering, found: Sequence[Things], photo: str | None) -> Facing:
-    """Return how things are seen: in a photo, which may show some of those found, or as `sight_of` does."""
-    if photo is None:
-        return partial(sight_of, scene)
-    seen = sight_of(scene, [thing for one in found for thing in (*one.things, *one.candidates)], photo)
-    return lambda _: seen
+def facing(scene: Answering, request: Request, found: Sequence[Things], photo: str | None) -> Sight:
+    """Return the directions in which a whole question is meant: those of a photo, which may show some of the
+    things found, or of the one that shows most of those asked for."""
+    every = [thing for one in found for thing in (*one.things, *one.candidates)]
+    own = [thing for one in found for thing in one.things if one.word == request.word]
+    return sight_of(scene, own if own and photo is None else every, photo)
 
 
 def parse(text: str, names: Iterable[str] = ()) -> Request:
@@ -208,18 +206,17 @@ def _check_name(name: str) -> None:
         raise UserError(told + "quotes hold a phrase")
 
 
-def answer(request: Request, found: Sequence[Things], sight: Facing) -> list[Thing]:
-    """Choose the things that a request asks for. `found` holds the things of `Request.words`; `sight` returns
-    the directions in which some things are seen. Raises UserError if a thing that the relation refers to is
-    not found, or if fewer things are found, or seen from there, than the ordinal asks for."""
+def answer(request: Request, found: Sequence[Things], view: Sight) -> list[Thing]:
+    """Choose the things that a request asks for. `found` holds the things of `Request.words`. Raises
+    UserError if a thing that the relation refers to is not found, or if fewer things are found, or seen from
+    there, than the ordinal asks for."""
     things = {one.word: one.things for one in found}
     chosen = list(things[request.word])
     if request.without:
         gone = {thing.id for thing in things[request.without]}
         chosen = [thing for thing in chosen if thing.id not in gone]
-    view = sight(chosen or [thing for listed in things.values() for thing in listed])
     if request.relation:
-        others = [answer(other, found, sight) for other in request.others]
+        others = [answer(other, found, view) for other in request.others]
         if missing := [other.word for other, there in zip(request.others, others, strict=True) if not there]:
             raise UserError(
                 f"no {missing[0]} found, to which a relation has an answer: leave it out, or teach the word"
@@ -239,13 +236,13 @@ def answer(request: Request, found: Sequence[Things], sight: Facing) -> list[Thi
     return sorted(chosen, key=lambda thing: sign * measure(thing, kind, view))[nth - 1 : nth]
 
 
-def assumed(request: Request, found: Sequence[Things], sight: Facing) -> str:
+def assumed(request: Request, found: Sequence[Things], view: Sight) -> str:
     """Tell which relations refer to any of several things, such as *the portal* where five are found.
     Arguments are those of `answer`, which answers the request."""
     several = list[str]()
     for part in request.parts:
         pair = part.relation == "between" and len(part.others) == 1
-        counts = [(len(answer(other, found, sight)), other.word) for other in part.others]
+        counts = [(len(answer(other, found, view)), other.word) for other in part.others]
         several += [f"{word}: {n} found, any of them counts" for n, word in counts if n > 1 + pair]
     return "; ".join(several)
 
@@ -255,7 +252,8 @@ class Answer:
     """The answer to a question about things. As a text it has all of it."""
 
     text: str
-    """A number, or how many things were found, with their ids and a photo of each."""
+    """A number, or how many things were found, with their ids and a photo of each, and which photo tells left
+    and right."""
     things: list[Thing]
     """The things that the question asks for."""
     caution: str | None
@@ -265,16 +263,19 @@ class Answer:
         return self.text + (f" ({self.caution})" if self.caution else "")
 
 
-def answered(request: Request, found: Sequence[Things], sight: Facing) -> Answer:
+def answered(request: Request, found: Sequence[Things], view: Sight) -> Answer:
     """Answer a request. Arguments and errors are those of `answer`."""
-    chosen = answer(request, found, sight)
+    chosen = answer(request, found, view)
     counted = request == Request(request.word, count=True)
     told = found[0].count if counted else f"{len(chosen)}"  # a count's range tells how sure it is
     if not request.count:
         listed = some([f"id {one.id} in {one.best_photo}" for one in chosen])
         told = f"{told} found: {listed}" if chosen else "none found"
-    doubt = None if counted else unsure(request, found, sight)
-    notes = [assumed(request, found, sight), doubt and f"unsure, since {doubt}"]
+    sides = ("left", "right", "front", "behind")
+    if view.photo and any(part.relation in sides or part.order[0] == "left" for part in request.parts):
+        told += f"; as seen from {view.photo}"
+    doubt = None if counted else unsure(request, found, view)
+    notes = [assumed(request, found, view), doubt and f"unsure, since {doubt}"]
     notes += [f"{one.word}: {one.caution}" for one in found if one.caution]
     return Answer(told, chosen, "; ".join(filter(None, notes)) or None)
 
@@ -283,45 +284,45 @@ def answer_question(scene: Answering, text: str, photo: str | None = None) -> An
     """Answer a question; see `Scene.answer`."""
     request = parse(text, scene.words)
     found = things_of(scene, ask(scene, [Prompt(word) for word in request.words]))
-    return answered(request, found, facing(scene, found, photo))
+    return answered(request, found, facing(scene, request, found, photo))
 
 
-def unsure(request: Request, found: Sequence[Things], sight: Facing) -> str | None:
+def unsure(request: Request, found: Sequence[Things], view: Sight) -> str | None:
     """Tell what may make an answer wrong; None if nothing does. Arguments are those of `answer`.
 
     The answer has to be the same without the things that few photos show, and with all candidates. A list may
     lack what a count may (`MISSED`). Sizes are known roughly: where the next thing is nearly as large, either
     may be the largest.
     """
-    listed = _told(replace(request, count=False), found, sight)
+    listed = _told(replace(request, count=False), found, view)
     wide = set[str]()
     if isinstance(listed, frozenset) and int(MISSED * len(listed)) > len(listed):
         wide.add(request.word)
     for one in (one for one in found if one.word in request.words):
         ways = (one.things, one.sure, [*one.things, *one.candidates])
         each = [[replace(other, things=some) if other is one else other for other in found] for some in ways]
-        if len({_told(request, other, sight) for other in each}) > 1:
+        if len({_told(request, other, view) for other in each}) > 1:
             wide.add(one.word)
     told = [f"{one.word}: {one.count}" for one in found if one.word in wide]
     if any(part.relation in ("above", "below") or part.order[0] in ("top", "tall") for part in request.parts):
-        told += [] if sight([]).upright else ["the photos don't tell which way is up"]
-    close = (_close(part, found, sight) for part in request.parts)
+        told += [] if view.upright else ["the photos don't tell which way is up"]
+    close = (_close(part, found, view) for part in request.parts)
     return ", ".join(told) or next(filter(None, close), None)
 
 
-def _told(request: Request, found: Sequence[Things], sight: Facing) -> int | frozenset[int] | None:
+def _told(request: Request, found: Sequence[Things], view: Sight) -> int | frozenset[int] | None:
     with suppress(UserError):
-        chosen = answer(request, found, sight)
+        chosen = answer(request, found, view)
         return len(chosen) if request.count else frozenset(thing.id for thing in chosen)
     return None
 
 
-def _close(request: Request, found: Sequence[Things], sight: Facing) -> str | None:
+def _close(request: Request, found: Sequence[Things], view: Sight) -> str | None:
     kind, sign = request.order
-    if kind in ("", "left", "top") or _told(request, found, sight) is None:
+    if kind in ("", "left", "top") or _told(request, found, view) is None:
         return None
-    listed = answer(replace(request, superlative=None, nth=None), found, sight)
-    view, nth = sight(listed), request.nth or 1
+    listed = answer(replace(request, superlative=None, nth=None), found, view)
+    nth = request.nth or 1
     sizes = sorted((measure(thing, kind, view) for thing in listed), key=lambda size: sign * size)
     next_to = pairwise(sizes[max(nth - 2, 0) : nth + 1])
     close = any(max(pair) < CLOSE * min(pair) for pair in next_to)

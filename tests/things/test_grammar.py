@@ -10,7 +10,20 @@ from painted_scene import painted_file, painted_scene
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.scene.georeference import Georeference
 from lang3dxl_ns.things.find import Things, is_upright
-from lang3dxl_ns.things.grammar import Request, Sight, answer, assumed, meant, parse, sight_of, table, unsure
+from lang3dxl_ns.things.grammar import (
+    Request,
+    Sight,
+    answer,
+    answered,
+    assumed,
+    facing,
+    meant,
+    parse,
+    sight_of,
+    table,
+    unsure,
+)
+from lang3dxl_ns.things.thing import Sighting
 from lang3dxl_ns.words.taught_words import Example
 
 
@@ -143,7 +156,7 @@ def test_questions_choose_by_place_and_size_and_mirror_with_the_viewer():
     mirrored = Sight(-SIGHT.right, SIGHT.up, SIGHT.ahead)
 
     def ids(text: str, sight: Sight = SIGHT) -> list[int]:
-        return [one.id for one in answer(parse(text), found, lambda _: sight)]
+        return [one.id for one in answer(parse(text), found, sight)]
 
     assert ids("second window from the left") == [0]
     assert ids("second window from the right") == ids("second window from the left", mirrored) == [3]
@@ -166,7 +179,7 @@ def test_left_and_right_are_told_among_what_the_view_shows():
     found, near = [Things("window", row)], replace(SIGHT, shown=frozenset({0, 3}))
 
     def ids(text: str) -> list[int]:
-        return [one.id for one in answer(parse(text), found, lambda _: near)]
+        return [one.id for one in answer(parse(text), found, near)]
 
     assert ids("leftmost window") == ids("second window from the right") == [0]
     assert ids("rightmost window") == ids("second window from the left") == [3]
@@ -193,6 +206,33 @@ def test_left_and_right_in_a_photo_are_told_among_what_it_shows():
     assert sight_of(scene, nowhere, first.name).shown == {one.id for one in windows}
     assert sight_of(scene, windows, away.name).shown == frozenset()
     assert sight_of(scene, windows).shown is None
+
+
+def test_one_photo_tells_left_and_right_in_a_whole_question():
+    """The one that shows most of what is asked for, whatever shows most of what it refers to."""
+    plain = painted_file()
+    first = plain.photos[0]
+    turned = [[-row[0], row[1], -row[2], row[3]] for row in first.camera_to_world]
+    back = replace(first, name="back.jpg", camera_to_world=turned)
+    scene = painted_scene(file=replace(plain, photos=[*plain.photos, back]))
+    box = (0, 0, 9, 9)
+    windows = [
+        replace(thing(i, "window", (x, 0, 0)), sightings=[Sighting(first.name, box)])
+        for i, x in enumerate((0, 3))
+    ]
+    doors = [
+        replace(thing(i, "door", (x, 0, 0)), sightings=[Sighting("back.jpg", box)])
+        for i, x in ((5, -3), (6, 6))
+    ]
+    found = [Things("window", windows), Things("door", doors)]
+    for text, chosen in (
+        ("window left of the rightmost door", [0, 1]),
+        ("door left of the rightmost window", [6]),
+    ):
+        request = parse(text)
+        view = facing(scene, request, found, None)
+        assert {one.id for one in answer(request, found, view)} == {*chosen}, text
+        assert answered(request, found, view).text.endswith(f"as seen from {view.photo}")
 
 
 def sight_in(*pose) -> Sight:
@@ -239,10 +279,10 @@ def test_heights_are_doubted_where_cameras_do_not_tell_which_way_is_up():
     ]
     lost = replace(SIGHT, upright=False)
     for text in ("highest window", "window below the dome", "first window from the top", "tallest dome"):
-        assert "which way is up" in unsure(parse(text), found, lambda _: lost)
-        assert unsure(parse(text), found, lambda _: SIGHT) is None
+        assert "which way is up" in unsure(parse(text), found, lost)
+        assert unsure(parse(text), found, SIGHT) is None
     for text in ("leftmost window", "largest window", "window next to the dome"):
-        assert unsure(parse(text), found, lambda _: lost) is None
+        assert unsure(parse(text), found, lost) is None
 
 
 def test_a_relation_to_several_things_tells_that_any_counts():
@@ -250,14 +290,14 @@ def test_a_relation_to_several_things_tells_that_any_counts():
     found = [Things("window", [thing(9, "window", (2, 0, 0))]), Things("gate", gates)]
 
     def told(text: str, some=found) -> str:
-        return assumed(parse(text), some, lambda _: SIGHT)
+        return assumed(parse(text), some, SIGHT)
 
     assert told("window left of the gate") == "gate: 3 found, any of them counts"
     assert told("window left of the leftmost gate") == told("leftmost window") == ""
     assert told("window between the gates", [found[0], Things("gates", gates)]) != ""
     assert told("window between the gates", [found[0], Things("gates", gates[:2])]) == ""
     with pytest.raises(UserError, match="gates: only one found"):
-        answer(parse("window between the gates"), [found[0], Things("gates", gates[:1])], lambda _: SIGHT)
+        answer(parse("window between the gates"), [found[0], Things("gates", gates[:1])], SIGHT)
 
 
 def test_a_scene_answers_with_text_things_and_caution():
@@ -267,7 +307,11 @@ def test_a_scene_answers_with_text_things_and_caution():
     left = scene.answer("leftmost window")
     (found,) = left.things
     assert found.center[0] == min(one.center[0] for one in counted.things)
-    assert left.text == f"1 found: id {found.id} in {found.best_photo}"
+    assert left.text.startswith(f"1 found: id {found.id} in {found.best_photo}; as seen from ")
+    assert (
+        scene.answer("highest window").text.endswith(".jpg")
+        and "seen" not in scene.answer("highest window").text
+    )
     assert str(left) == f"{left.text} ({left.caution})" and "unsure" in left.caution
     assert "flamingo: " in scene.answer("how many flamingo").caution  # the word itself is doubted
     assert "did you mean windows?" in scene.answer("how many windwos").caution
@@ -296,7 +340,7 @@ def test_an_answer_has_a_caution_if_doubt_would_change_it():
 
     def caution(text: str, things, candidates=()) -> str | None:
         found = [Things("window", things, list(candidates)), Things("portal", [portal])]
-        return unsure(parse(text), found, lambda _: SIGHT)
+        return unsure(parse(text), found, SIGHT)
 
     assert caution("leftmost window", windows) is None
     assert caution("leftmost window", windows, [perhaps]) == "window: 3, perhaps 3 to 4"

@@ -171,10 +171,10 @@ def test_questions_choose_the_things_that_python_chooses_and_are_as_unsure(page)
     answers = module(page, "grammar", body, {"asked": ASKED, "found": given, "view": view})
     tilted = replace(SIGHT, upright=False)
     for text, (chosen, doubt, lost, any_of) in zip(ASKED, answers, strict=True):
-        assert chosen == [t.id for t in answer(parse(text), found, lambda _: SIGHT)], text
-        assert doubt == unsure(parse(text), found, lambda _: SIGHT), text
-        assert lost == unsure(parse(text), found, lambda _: tilted), text
-        assert any_of == assumed(parse(text), found, lambda _: SIGHT), text
+        assert chosen == [t.id for t in answer(parse(text), found, SIGHT)], text
+        assert doubt == unsure(parse(text), found, SIGHT), text
+        assert lost == unsure(parse(text), found, tilted), text
+        assert any_of == assumed(parse(text), found, SIGHT), text
     assert sum(len(chosen) for chosen, *_ in answers) > 20
     assert 5 < sum(doubt is None for _, doubt, *_ in answers) < len(ASKED) - 5
     assert 5 < sum(not any_of for *_, any_of in answers) < len(ASKED) - 5
@@ -199,7 +199,7 @@ def test_questions_choose_the_things_that_python_chooses_and_are_as_unsure(page)
 
 def chosen_or_error(text: str, found: list[Things], view: Sight) -> list[int] | str:
     try:
-        return [thing.id for thing in answer(parse(text), found, lambda _: view)]
+        return [thing.id for thing in answer(parse(text), found, view)]
     except UserError as error:
         return str(error)
 
