@@ -23,8 +23,8 @@ export function parse(text, names = []) {
 /** Cut off how a question begins and ends. */
 function opened(text, names) {
   const { text: typed, restored } = held(text, names);
-  const ends = `[${language.ends}]+`, relation = any(grammar.relations), tail = any(grammar.tail);
-  let rest = typed.toLowerCase().replace(new RegExp(`^${ends}|${ends}$`, "g"), "").split(/\s+/).filter(Boolean).join(" ");
+  const ends = `[${language.ends}]`, relation = any(grammar.relations), tail = any(grammar.tail);
+  let rest = typed.toLowerCase().replace(new RegExp(`^${ends}+|(?<!${ends})${ends}+$`, "g"), "").split(/\s+/).filter(Boolean).join(" ");
   rest = rest.replace(new RegExp(wholeWords(any(grammar.same)), "gu"), (word) => grammar.same[word]);
   const cut = (pattern) => rest !== (rest = rest.replace(pattern, ""));
   rest = rest.replace(new RegExp(`(?<=st|nd|rd|th)-(?=(?:${any(grammar.superlatives)}) )`, "g"), " "); // second-highest

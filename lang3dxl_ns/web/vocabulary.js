@@ -50,8 +50,8 @@ export function parsePrompts(typed, names = []) {
 /** Find out what a prompt searches for, and which parts of it the answer does not use, as [kind, part]. */
 export function meaning(text) {
   if (/^(The )?[A-Z][\p{L}\p{N}_]* [A-Z][\p{L}\p{N}_]*/u.test(text) && english(text) === text) return { target: text, unused: [] };
-  const unused = [], ends = `[\\s${language.ends}]+`;
-  let target = text.replace(new RegExp(`^${ends}|${ends}$`, "g"), "") || text;
+  const unused = [], ends = `[\\s${language.ends}]`;
+  let target = text.replace(new RegExp(`^${ends}+|(?<!${ends})${ends}+$`, "g"), "") || text;
   const cut = (pattern) => (target = target.replace(pattern, ""));
   const [asks, counted] = new RegExp(`^(?:(?:${any("lead")})\\s+)?((?:${any("count")})\\s+)?(?=\\S)`, "iu").exec(target) ?? [""];
   if (counted) unused.push(["count", counted.trim()]);

@@ -564,10 +564,10 @@ def test_counts_in_a_strange_scene_have_a_caution_and_taught_names_are_whole(bro
     strange = painted_scene()
     strange.__dict__.update(foreignness=FAR)
     mark = Example(strange.photos[0].name, points=((48.0, 48.0),))
-    write_page(Page(strange.teach("Hole in the wall", mark)), tmp_path)
+    write_page(Page(strange.teach("Big hole in the wall", mark)), tmp_path)
     with served(tmp_path) as address:
         page = opened(browser, address, DESK)
         told = page.evaluate("lang3dxl.ask('how many windows').then(({ told }) => told)")
-        taught = page.evaluate("lang3dxl.ask('how many hole in the wall').then(({ told }) => told)")
+        taught = page.evaluate("lang3dxl.ask('how many big hole in the wall').then(({ told }) => told)")
     assert told.startswith("windows: 2") and "Not sure" in told
-    assert taught.startswith("hole in the wall: ")
+    assert taught.startswith("big hole in the wall: ") and "told apart" not in taught
