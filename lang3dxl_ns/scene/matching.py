@@ -5,7 +5,6 @@ Both are stored as they are made, so that an interrupted reconstruction can be r
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import shutil
@@ -23,7 +22,7 @@ from numpy import ndarray as Array
 
 from lang3dxl_ns.common.console import progress, say, some
 from lang3dxl_ns.common.errors import DAMAGE, UserError, is_plain
-from lang3dxl_ns.common.files import check_room, read_json, replace_file
+from lang3dxl_ns.common.files import check_room, content_digest, read_json, replace_file
 from lang3dxl_ns.common.memory import machine_memory
 from lang3dxl_ns.common.options import data_option
 from lang3dxl_ns.common.pictures import open_picture
@@ -363,7 +362,7 @@ def _digest(path: Path) -> str:
 
 @cache  # duplicates are looked for, then features that are kept
 def _read_digest(path: Path, size: int, changed: int) -> str:
-    return hashlib.blake2b(path.read_bytes(), digest_size=16).hexdigest()
+    return content_digest(path)
 
 
 def _threads(memory_each: float) -> int:
