@@ -172,11 +172,7 @@ class Capture:
         """Similarity to training's coordinates from the original ones, which a transforms.json may have
         moved."""
         moved = self.transforms
-        if moved is None or (moved.applied is None and moved.applied_scale == 1):
-            return self.frame
-        return self.frame.after(
-            np.eye(4)[:3] if moved.applied is None else moved.applied, moved.applied_scale
-        )
+        return self.frame if moved is None else self.frame.after(moved.applied, moved.applied_scale)
 
     def poses(self, names: Sequence[str]) -> Float32[Array, "n 3 4"]:
         """Compute photos' poses in training's frame (camera → world; x right, y up, z backward)."""
