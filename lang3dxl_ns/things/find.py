@@ -22,7 +22,7 @@ from lang3dxl_ns.query.text import Prompt
 from lang3dxl_ns.query.trust import FAR
 from lang3dxl_ns.query.vocabulary import searched, shipped_vocabulary, singular
 from lang3dxl_ns.rendering import composite, harmonics_of
-from lang3dxl_ns.scene.camera import in_camera_frame
+from lang3dxl_ns.scene.camera import projected
 from lang3dxl_ns.things.join import VIEWS, Joined, grown, join, parted, placed, without_crumbs
 from lang3dxl_ns.things.pieces import FILLED, LEVELS, Piece, Shown, pieces_of
 from lang3dxl_ns.things.thing import Box, Sighting, Thing, upright_box
@@ -244,23 +244,20 @@ def _sharpened(scene: Answering, relevancy: Float[Tensor, " n"], colors: Array) 
 @torch.no_grad()
 def _views(scene: Answering, heat: Float[Tensor, "n q"]) -> Iterator[list[Shown]]:
     """Render each training view's heat maps at the size that it was trained at."""
-    means, splats = scene.splats.means, scene.splats
     for name, view in scene.visible.items():
         photo = scene.file.photo(name)
         camera = photo.camera
-        seen = in_camera_frame(camera, means)
-        lit = torch.cat([heat.to(means), torch.ones_like(seen[:, 2:])], 1)
-        drawn = composite(splats, camera, torch.cat([lit, lit * seen[:, 2:]], 1))
+        points = projected(camera, scene.splats.means)
+        lit = torch.cat([heat.to(points), torch.ones_like(points[:, 2:])], 1)
+        drawn = composite(scene.splats, camera, torch.cat([lit, lit * points[:, 2:]], 1))
         maps, depths = np.split(np.moveaxis(drawn.cpu().numpy(), 2, 0), 2)
         inside = photo.foreground((camera.height, camera.width))
         keep = 1.0 if inside is None else inside.numpy()
-        rows = view.rows[view.pixels >= FILLED].long().cpu().numpy()
-        points = seen.cpu().numpy()[rows]
-        lens = camera.intrinsics.cpu().numpy()
-        points = np.column_stack([(points / points[:, 2:]) @ lens[:2].T, points[:, 2]])
+        rows = view.rows[view.pixels >= FILLED].long()
+        shown, numbers, focal = points[rows].cpu().numpy(), rows.cpu().numpy(), float(camera.intrinsics[0, 0])
         *matched, surface = depths / np.maximum(maps, 1e-4)
         yield [
-            Shown(name, one, surface, depth, rows, points, float(lens[0, 0]))
+            Shown(name, one, surface, depth, numbers, shown, focal)
             for one, depth in zip(maps[:-1] * keep, matched, strict=True)
         ]
 
