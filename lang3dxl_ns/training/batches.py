@@ -134,7 +134,7 @@ class TrainingData:
         use."""
         folder, config = self.capture.folder, self.config
         links = self.capture.settings.follow_links
-        masked = with_foreground(self.as_read, config, folder, self.cache_dir, self.device, say, links)
+        masked = with_foreground(self.as_read, config, folder, self.cache_dir, self.device, links)
         return {photo.name: photo for photo in masked}
 
     @cached_property
