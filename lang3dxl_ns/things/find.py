@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 
 import numpy as np
 import torch
@@ -97,8 +96,6 @@ def things_of(scene: Answering, question: Question) -> list[Things]:
     they separate neighbors: the wall between two windows that CLIP sees as one.
     """
     question = _in_singular(scene, question)
-    mass = scene.mass.double().cpu().numpy()
-    means, axes = scene.splats.means.double().cpu().numpy(), axes_of(scene)
     colors = harmonics_of(scene.baked().colors(scene.overview.camera.position).clamp(0, 1))[:, 0]
     colors = colors.nan_to_num()  # of Gaussians that lie nowhere
     sharp = [_sharpened(scene, relevancy, colors.cpu().numpy()) for relevancy in question.relevancy]
@@ -109,36 +106,53 @@ def things_of(scene: Answering, question: Question) -> list[Things]:
         for found, view, best in zip(pieces, views, peak, strict=True):
             shown[view.photo] = view.rows
             found += pieces_of(view) if best > LEVELS[0] else []
+    axes = axes_of(scene)
+    return [_answer(scene, question, row, own, shown, axes) for row, own in enumerate(pieces)]
 
-    def box(weight: Float[Array, " n"], one: Joined) -> Box:
+
+def _answer(
+    scene: Answering,
+    question: Question,
+    row: int,
+    pieces: Sequence[Piece],
+    shown: Mapping[str, Int[Array, " m"]],
+    axes: Float[Array, "3 3"],
+) -> Things:
+    """Find the things of the question's prompt in a row. `shown`: the Gaussians that each photo shows;
+    `axes`: directions of all boxes' edges."""
+    prompt, values = question.prompts[row], question.relevancy[row].double().cpu().numpy()
+    mass, means = scene.mass.double().cpu().numpy(), scene.splats.means.double().cpu().numpy()
+    weight = np.sqrt(mass) * values
+
+    def box(one: Joined) -> Box:
         return upright_box(means[one.rows], weight[one.rows], axes)
 
-    answers, shown_in = list[Things](), sum(len(view.rows) > 0 for view in scene.visible.values())
-    for i, prompt in enumerate(question.prompts):
-        values = question.relevancy[i].double().cpu().numpy()
-        weight = np.sqrt(mass) * values
-        boxed = partial(box, weight)
-        whole = grown(join(pieces[i], weight, boxed, shown), len(weight))
-        parts = parted(whole, means @ axes[:2].T, weight, APART * scene.gap)
-        joined = sorted(placed(parts, [boxed(part) for part in parts]), key=lambda one: -one.weight)
-        seen = [one for one in without_crumbs(joined) if one.views >= VIEWS]
-        sure = [one for one in seen if prompt.taught or values[one.rows].max() >= PRESENT]
-        better = {} if prompt.taught else better_words(scene, prompt, sure, (weight * values) ** 2)
-        sure = [one for one in sure if one not in better]
-        rest = [one for one in joined if one not in sure]
-        things, candidates = (
-            [_thing(prompt.name, one, boxed(one), mass, values) for one in some] for some in (sure, rest)
-        )
-        trust, far = question.trusts[i], (scene.foreignness or 0) >= FAR and prompt.taught is None
-        caution = trust.reason if far or trust.level != "sure" else None
-        if better and not things:
-            caution = f"what was found fits {next(iter(better.values()))!r} better"
-        if shown_in < VIEWS:
-            caution = (
-                f"{'one' if shown_in else 'no'} training photo shows the scene, and a thing is what two show"
-            )
-        answers.append(Things(prompt.name, things, candidates, caution))
-    return answers
+    whole = grown(join(pieces, weight, box, shown), len(weight))
+    parts = parted(whole, means @ axes[:2].T, weight, APART * scene.gap)
+    joined = sorted(placed(parts, [box(part) for part in parts]), key=lambda one: -one.weight)
+    seen = [one for one in without_crumbs(joined) if one.views >= VIEWS]
+    sure = [one for one in seen if prompt.taught or values[one.rows].max() >= PRESENT]
+    better = {} if prompt.taught else better_words(scene, prompt, sure, (weight * values) ** 2)
+    sure = [one for one in sure if one not in better]
+    rest = [one for one in joined if one not in sure]
+    things, candidates = (
+        [_thing(prompt.name, one, box(one), mass, values) for one in some] for some in (sure, rest)
+    )
+    instead = next(iter(better.values()), None) if not things else None
+    return Things(prompt.name, things, candidates, _caution(scene, question, row, instead))
+
+
+def _caution(scene: Answering, question: Question, row: int, instead: str | None) -> str | None:
+    """Say why the answer to a prompt is doubtful, or counts are; None if neither is. `instead`: the word that
+    all that was found fits better; None if some of it fits the prompt."""
+    shown_in = sum(len(view.rows) > 0 for view in scene.visible.values())
+    if shown_in < VIEWS:
+        return f"{'one' if shown_in else 'no'} training photo shows the scene, and a thing is what two show"
+    if instead is not None:
+        return f"what was found fits {instead!r} better"
+    trust, taught = question.trusts[row], question.prompts[row].taught
+    far = (scene.foreignness or 0) >= FAR and taught is None
+    return trust.reason if far or trust.level != "sure" else None
 
 
 def _in_singular(scene: Answering, question: Question) -> Question:
