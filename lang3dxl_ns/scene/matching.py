@@ -102,7 +102,6 @@ def feature_database(
 ) -> Path:
     """Make the database of photos and cameras, or reuse one with the same photos and settings. A new one has
     the features of photos whose bytes an older one knows, here or in the folders `earlier`."""
-    pycolmap = load_pycolmap()
     number = dict(zip(photos.names, copies.names, strict=True))
     paths = {name: photos.folder / name for name in photos.names}
     told = [(name, path.stat().st_size, _digest(path), number[name]) for name, path in paths.items()]
@@ -116,20 +115,7 @@ def feature_database(
     importing = work / "importing.db"
     for old in work.glob("importing.db*"):
         old.unlink()
-    pycolmap.Database.open(importing).close()
-    groups = shared_cameras(photos)
-    if settings.one_camera is not None:
-        groups = [list(photos.names)] if settings.one_camera else [[name] for name in photos.names]
-    for group in groups:
-        numbers = [number[name] for name in group]
-        pycolmap.import_images(importing, copies.folder, pycolmap.CameraMode.SINGLE, numbers)
-    _correct_lenses(importing)
-    if settings.one_camera:  # COLMAP passes over photos of another size, and later gives each its own
-        with pycolmap.Database.open(importing) as db:
-            odd = [name for name in photos.names if not db.exists_image(number[name])]
-        if odd:
-            several = f"{some(odd)} can't share the camera of {photos.names[0]}, which has another size"
-            raise UserError(f"{several}: lang3dxl reconstruct without --one-camera, or without them")
+    _import(importing, photos, copies, settings.one_camera)
     wanted = {content: name for *_, content, name in told}
     for folder in (work, *earlier):
         _keep_features(folder, importing, wanted, made)
@@ -141,6 +127,26 @@ def feature_database(
     importing.rename(database)
     replace_file(stamped, stamp)
     return database
+
+
+def _import(database: Path, photos: PhotoFolder, copies: PhotoFolder, one_camera: bool | None) -> None:
+    """Make a database of photos and the cameras that took them. Raises UserError if one camera can't have
+    taken all."""
+    pycolmap, number = load_pycolmap(), dict(zip(photos.names, copies.names, strict=True))
+    pycolmap.Database.open(database).close()
+    groups = shared_cameras(photos)
+    if one_camera is not None:
+        groups = [list(photos.names)] if one_camera else [[name] for name in photos.names]
+    for group in groups:
+        numbers = [number[name] for name in group]
+        pycolmap.import_images(database, copies.folder, pycolmap.CameraMode.SINGLE, numbers)
+    _correct_lenses(database)
+    if one_camera:  # COLMAP passes over photos of another size, and later gives each its own
+        with pycolmap.Database.open(database) as db:
+            odd = [name for name in photos.names if not db.exists_image(number[name])]
+        if odd:
+            several = f"{some(odd)} can't share the camera of {photos.names[0]}, which has another size"
+            raise UserError(f"{several}: lang3dxl reconstruct without --one-camera, or without them")
 
 
 def _correct_lenses(database: Path) -> None:
