@@ -156,7 +156,7 @@ def _best_mapping(
 ) -> _Mapping:
     """Map so many photos, and where plain SIFT leaves many without a pose, map again with stronger features.
 
-    Not where sides look alike to SIFT: stronger features put photos on the wrong one."""
+    Where sides look alike to SIFT, the first models stay: stronger features put photos on the wrong side."""
     if settings.features != "auto":
         return mapped(work, settings)
     plain = mapped(work, replace(settings, features="sift"))
