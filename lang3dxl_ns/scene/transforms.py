@@ -273,7 +273,7 @@ def _size(frame: Mapping[str, Any], path: Path, name: str) -> tuple[int, int]:
 
 
 def _focal(frame: Mapping[str, Any], width: int, height: int) -> tuple[float, float, float, float]:
-    """Return fx, fy, cx, cy. Angles of view may stand for focal lengths."""
+    """Return fx, fy, cx, cy. Angles of view may stand for focal lengths, and one axis for both."""
 
     def along(axis: str, side: int) -> float | None:
         if f"fl_{axis}" in frame:
@@ -285,15 +285,13 @@ def _focal(frame: Mapping[str, Any], width: int, height: int) -> tuple[float, fl
                 return side / 2 / math.tan(angle / 2)
         return None
 
-    fx, fy = along("x", width), along("y", height)
-    if fx is None and fy is None:
+    known = [focal for focal in (along("x", width), along("y", height)) if focal is not None]
+    if not known:
         raise KeyError("fl_x or camera_angle_x")
-    fx, fy = fx if fx is not None else fy, fy if fy is not None else fx
-    assert fx is not None and fy is not None
     cx, cy = (
         _number(frame, key) if key in frame else side / 2 for key, side in (("cx", width), ("cy", height))
     )
-    return fx, fy, cx, cy
+    return known[0], known[-1], cx, cy
 
 
 def _distortion(frame: Mapping[str, Any], model: str, fisheye: bool, name: str) -> tuple[float, ...]:
