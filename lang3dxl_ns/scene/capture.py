@@ -202,10 +202,10 @@ def open_capture(
 
     Args:
         data: folder with a COLMAP model, with a transforms.json, or with photos alone; or a transforms.json,
-            or a video. Photos without poses are reconstructed, which takes minutes. settings: where its parts
-            are, and how it is split and normalized. cache_dir: folder of a reconstruction, if not
-            lang3dxl_cache in the folder. may_reconstruct: whether photos may be reconstructed, and frames of
-            a video extracted.
+            or a video. Photos without poses are reconstructed, which takes minutes.
+        settings: where its parts are, and how it is split and normalized.
+        cache_dir: folder of a reconstruction, if not lang3dxl_cache in the folder.
+        may_reconstruct: whether photos may be reconstructed, and frames of a video extracted.
 
     Raises:
         UserError: there are no photos, or none of them can be used, or the file with their cameras is

@@ -41,6 +41,7 @@ _STEPS, _REPEATED = 20, 2
 and 5 change no place, and for a thousand photos a step takes ten seconds."""
 _SAVED = 100
 """Photos that get a pose between two snapshots of mapping, from which a stopped one goes on."""
+_PLACED = "photos with a pose"
 _RELAXED = {"init_min_num_inliers": 30, "init_min_tri_angle": 4.0, "abs_pose_min_num_inliers": 15}
 """Thresholds of the incremental mapper where it finds no model with the usual ones."""
 
@@ -48,14 +49,8 @@ _RELAXED = {"init_min_num_inliers": 30, "init_min_tri_angle": 4.0, "abs_pose_min
 def map_photos(
     database: Path, photos: PhotoFolder, work: Path, kind: str, points: int = _POINTS
 ) -> list[pycolmap.Reconstruction]:
-    """Map photos by the features and matches in a database, and return the models, largest first.
-
-    Args:
-        database: COLMAP's database.
-        photos: the photos, by their names in the database.
-        work: folder for snapshots and what the mapper writes.
-        kind: "global", or "incremental", which may need `_RELAXED`.
-        points: fewest points that have to agree on a photo's pose.
+    """Map photos by the matches in a database, and return the models, largest first. `work` gets snapshots.
+    The mapper is "global", or "incremental", for which `points` have to agree on a pose, or `_RELAXED` holds.
     """
     if kind == "global":
         models = _globally(database, photos, work)
@@ -80,7 +75,7 @@ def map_without(
 
 def _globally(database: Path, photos: PhotoFolder, work: Path) -> list[pycolmap.Reconstruction]:
     pycolmap = load_pycolmap()
-    with TemporaryDirectory(dir=work) as folder, progress("photos with a pose", len(photos.names)):
+    with TemporaryDirectory(dir=work) as folder, progress(_PLACED, len(photos.names)):
         options = pycolmap.GlobalPipelineOptions(random_seed=0, num_threads=os.cpu_count() or 1)
         return _usable(pycolmap.global_mapping(database, photos.folder, folder, options))
 
@@ -92,8 +87,7 @@ def _one_by_one(
     pycolmap = load_pycolmap()
     kept = work / SNAPSHOTS
     kept.mkdir(exist_ok=True)
-    bar = progress("photos with a pose", len(photos.names))
-    with TemporaryDirectory(dir=work) as folder, bar as advance:
+    with TemporaryDirectory(dir=work) as folder, progress(_PLACED, len(photos.names)) as advance:
         options = pycolmap.IncrementalPipelineOptions(
             min_model_size=SMALLEST_MODEL, extract_colors=False, mapper=thresholds,
             random_seed=0, num_threads=os.cpu_count() or 1,
@@ -104,12 +98,10 @@ def _one_by_one(
         begun = _largest_snapshot(kept, database)
         if begun:
             advance(pycolmap.Reconstruction(begun).num_reg_images())
+        files = database, photos.folder, folder
         placed = partial(_count, advance, kept)
-        return _usable(
-            pycolmap.incremental_mapping(
-                database, photos.folder, folder, options, begun or "", next_image_callback=placed
-            )
-        )
+        found = pycolmap.incremental_mapping(*files, options, begun or "", next_image_callback=placed)
+        return _usable(found)
 
 
 def _usable(found: dict[int, pycolmap.Reconstruction]) -> list[pycolmap.Reconstruction]:
