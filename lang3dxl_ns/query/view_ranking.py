@@ -178,6 +178,6 @@ def _peak(view: VisibleGaussians, scores: Float[Tensor, " n"]) -> Float[Tensor, 
 
 def _centeredness(view: VisibleGaussians, means: Float[Tensor, "n 3"]) -> Float[Tensor, " m"]:
     """Compute weights of 1 for Gaussians in the middle half of a view, falling to `RIM` at its rim."""
-    pixels = projected(view.camera, means[view.rows])[:, :2]
-    off = (2 * pixels / pixels.new_tensor([view.camera.width, view.camera.height]) - 1).abs().amax(1)
+    x, y, _ = projected(view.camera, means[view.rows]).unbind(1)
+    off = torch.maximum((2 * x / view.camera.width - 1).abs(), (2 * y / view.camera.height - 1).abs())
     return 1 - (1 - RIM) * ((off - 0.5) / 0.5).nan_to_num(1.0).clamp(0, 1)
