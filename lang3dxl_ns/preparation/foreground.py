@@ -45,9 +45,9 @@ def with_foreground(
     follow_links: bool = False,
 ) -> list[Photo]:
     """Return the photos with the masks configured in `config.foreground` (a folder is relative to `data`, and
-    with `follow_links` its masks may be links out of it), and say which have none. Raises UserError if
-    a folder is missing or matches no photo, if masks are damaged or all dark, and if a model can't be
-    loaded."""
+    with `follow_links` its masks may be links out of it), and say which have none. Raises UserError if a
+    folder is missing or matches no photo, if masks are damaged or all dark, and if a model can't be loaded.
+    """
     if config.foreground == "none":
         return [replace(photo, mask_path=None) for photo in photos]
     if config.foreground == "text":
