@@ -361,7 +361,7 @@ def stop_mapping(monkeypatch, after):
         return incremental(*arguments, next_image_callback=noted)
 
     monkeypatch.setattr(pycolmap, "incremental_mapping", mapping)
-    monkeypatch.setattr("lang3dxl_ns.scene.mapping._SAVED", 1)
+    monkeypatch.setattr(module, "_SAVED", 1)
     return placed
 
 
