@@ -71,24 +71,24 @@ def test_names_with_dots_spaces_unicode_folders_and_one_stem_stay_apart(folder, 
     assert len(paths) == 4
 
 
-def test_a_mask_that_fits_two_photos_of_one_stem_is_named_and_the_long_form_tells_them_apart(folder):
+def test_a_mask_that_fits_two_photos_of_one_stem_is_named_and_the_long_form_tells_them_apart(folder, capsys):
     rename(folder, "a.jpg", "a.png")
     (folder / "masks").mkdir()
     Image.new("L", (9, 7), 255).save(folder / "masks" / "a.png")  # of another size, too
-    lines = []
 
     def masks():
         photos = [photo for name, photo in parse(folder).items() if name[0] == "a"]
-        lines.clear()
-        with_foreground(photos, PreparationConfig(), folder, folder / "cache", "cpu", lines.append)
+        capsys.readouterr()
+        with_foreground(photos, PreparationConfig(), folder, folder / "cache", "cpu")
         return {photo.name: photo.mask_path.name for photo in photos}
 
     assert masks() == {"a.jpg": "a.png", "a.png": "a.png"}
-    assert "the mask of 2 photos, a.jpg, a.png" in lines[0]
-    assert "a.jpg.png" in lines[0]
+    said = capsys.readouterr().out
+    assert "the mask of 2 photos, a.jpg, a.png" in said
+    assert "a.jpg.png" in said
     Image.new("L", (9, 7), 255).save(folder / "masks" / "a.jpg.png")
     assert masks() == {"a.jpg": "a.jpg.png", "a.png": "a.png"}
-    assert lines == []
+    assert not capsys.readouterr().out
 
 
 # ── names and links that lead out of a folder ───────────────────────────────────────────────────────────

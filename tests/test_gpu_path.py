@@ -428,7 +428,7 @@ def bug_cpu_generator(model):
     ],
 )
 def test_planted_bugs_are_found(default, fake, monkeypatch, plant, error):
-    model = default.pipeline.model
+    model = default.pipeline.model.eval()
     monkeypatch.setattr(gaussians, "activated", gaussians.activated)  # so that it is restored
     plant(model)
     with fake_gpu(), pytest.raises((RuntimeError, TypeError), match=error):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import hashlib
 import json
 import math
 import os
@@ -57,6 +58,11 @@ def read_json(path: Path, most: int = _MOST_BYTES) -> Any:
         return json.loads(read_text(path, most))
     except RecursionError as error:
         raise ValueError("it is nested too deeply") from error
+
+
+def content_digest(path: Path) -> str:
+    """Compute 32 hex digits of a file's content."""
+    return hashlib.blake2b(path.read_bytes(), digest_size=16).hexdigest()
 
 
 def read_array(path: Path) -> Any:

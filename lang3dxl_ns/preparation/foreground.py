@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
@@ -16,7 +16,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 import torch
 
-from lang3dxl_ns.common.console import some, tracked
+from lang3dxl_ns.common.console import say, some, tracked
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.options import data_option, switched_on
 from lang3dxl_ns.common.pictures import NoPictureError, mask_values, open_picture
@@ -35,8 +35,6 @@ _READERS = 4
 _RULE = 1
 """Version of the masks, which is increased when they are made in another way, to make older ones again."""
 
-Log = Callable[[str], None]
-
 
 def with_foreground(
     photos: Sequence[Photo],
@@ -44,17 +42,16 @@ def with_foreground(
     data: Path,
     cache_dir: Path,
     device: torch.device | str,
-    log: Log = print,
     follow_links: bool = False,
 ) -> list[Photo]:
     """Return the photos with the masks configured in `config.foreground` (a folder is relative to `data`, and
-    with `follow_links` its masks may be links out of it), and log the photos without one. Raises UserError if
-    a folder is missing or matches no photo, if masks are damaged or all dark, and if a model can't be
-    loaded."""
+    with `follow_links` its masks may be links out of it), and say which have none. Raises UserError if a
+    folder is missing or matches no photo, if masks are damaged or all dark, and if a model can't be loaded.
+    """
     if config.foreground == "none":
         return [replace(photo, mask_path=None) for photo in photos]
     if config.foreground == "text":
-        return _prompted(photos, config, FeatureStore(cache_dir), device, log)
+        return _prompted(photos, config, FeatureStore(cache_dir), device)
     if config.foreground == "auto":
         masked = list(photos)  # with the masks found by the dataparser
     else:
@@ -66,26 +63,26 @@ def with_foreground(
                 f"no mask in {folder} is named like a photo (the first is {photos[0].name}): name masks like "
                 "the photos, with .png or .jpg"
             )
-    masked = _checked(masked, config.skip_damaged_masks, log)
+    masked = _checked(masked, config.skip_damaged_masks)
     without = [photo.name for photo in masked if photo.mask_path is None]
     if 0 < len(without) < len(masked):
-        log(f"{len(without)} of {len(masked)} photos have no mask and are used whole: {some(without)}")
+        say(f"{len(without)} of {len(masked)} photos have no mask and are used whole: {some(without)}")
     sharing: dict[Path, list[str]] = {}
     for photo in masked:
         if photo.mask_path is not None:
             sharing.setdefault(photo.mask_path, []).append(photo.name)
     for path, names in sharing.items():
         if len(names) > 1:  # photos whose names differ only in their suffix
-            log(
+            say(
                 f"{path} is the mask of {len(names)} photos, {some(names)}: if it belongs to one, name it "
                 f"like {path.parent / (PurePosixPath(names[0]).name + path.suffix)}"
             )
     return masked
 
 
-def _checked(photos: list[Photo], skip: bool, log: Log) -> list[Photo]:
-    """Read all masks, log the dark ones, and return the photos. Unreadable masks raise one UserError that
-    names them all; with `skip`, they are logged, and their photos count whole. Raises UserError if all masks
+def _checked(photos: list[Photo], skip: bool) -> list[Photo]:
+    """Read all masks, name the dark ones, and return the photos. Unreadable masks raise one UserError that
+    names them all; with `skip`, a message does, and their photos count whole. Raises UserError if all masks
     are dark."""
     masked = [photo for photo in photos if photo.mask_path is not None]
     with ThreadPoolExecutor(_READERS) as pool:
@@ -99,7 +96,7 @@ def _checked(photos: list[Photo], skip: bool, log: Log) -> list[Photo]:
             f"let these photos count whole: {switched_on(data_option('skip-damaged-masks'))}"
         )
     if damaged:
-        log(f"{len(damaged)} masks can't be read, and their photos count whole: {some(list(damaged))}")
+        say(f"{len(damaged)} masks can't be read, and their photos count whole: {some(list(damaged))}")
     if dark and len(dark) == len(photos):
         most = max(dark.values())
         how = f"dark (the brightest pixel has {most} of 255)" if most else "black"
@@ -108,7 +105,7 @@ def _checked(photos: list[Photo], skip: bool, log: Log) -> list[Photo]:
             f"Draw it white, or pass {data_option('foreground')} none"
         )
     if dark:
-        log(f"the masks of {len(dark)} photos are black or dark, nothing in them counts: {some(list(dark))}")
+        say(f"the masks of {len(dark)} photos are black or dark, nothing in them counts: {some(list(dark))}")
     return [replace(photo, mask_path=None) if photo.name in damaged else photo for photo in photos]
 
 
@@ -129,14 +126,10 @@ def foreground_kind(config: PreparationConfig) -> str:
 
 
 def _prompted(
-    photos: Sequence[Photo],
-    config: PreparationConfig,
-    store: FeatureStore,
-    device: torch.device | str,
-    log: Log,
+    photos: Sequence[Photo], config: PreparationConfig, store: FeatureStore, device: torch.device | str
 ) -> list[Photo]:
     """Make missing or outdated masks and return the photos with them. Photos in which nothing is found are
-    logged and used whole."""
+    named and used whole."""
     if not config.foreground_prompts:
         raise UserError(f"foreground text needs prompts: {data_option('foreground-prompts')} building")
     files = find_text_segmenter(config.foreground_model, config.sam)
@@ -150,7 +143,7 @@ def _prompted(
         if kept_picture(path, settings) is None:
             missing.append((photo, path, settings))
     if missing:
-        log(f"looking for {', '.join(config.foreground_prompts)} in {len(missing)} of {len(photos)} photos")
+        say(f"looking for {', '.join(config.foreground_prompts)} in {len(missing)} of {len(photos)} photos")
         segmenter, empty = load_text_segmenter(files, device), []
         store.remove_leftovers()
         for photo, path, settings in tracked(missing, "finding the foreground"):
@@ -165,5 +158,5 @@ def _prompted(
                 mask = torch.ones_like(mask)
             store.write_bytes(path, mask_png(mask, settings), f"the mask of {photo.name}")
         if empty:
-            log(f"found nothing in {len(empty)} photos, which are used whole: {some(empty)}")
+            say(f"found nothing in {len(empty)} photos, which are used whole: {some(empty)}")
     return [replace(photo, mask_path=paths.get(photo.name)) for photo in photos]

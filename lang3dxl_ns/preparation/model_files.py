@@ -6,6 +6,7 @@ Code that comes with a model is never run, and weights are read as plain tensors
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
@@ -51,8 +52,7 @@ class ModelFiles:
         """Fingerprint of a CLIP: `identity` and, after a dot, that of its tokenizer, on which the vectors of
         texts depend but no target does."""
         files = sorted(path for name in _TOKENIZER for path in self.folder.glob(name))
-        digests = [_digest(path, path.stat().st_size, path.stat().st_mtime_ns) for path in files]
-        return f"{self.identity}.{hashlib.sha256(''.join(digests).encode()).hexdigest()[:16]}"
+        return f"{self.identity}.{_digest_of_all(files)}"
 
     @property
     def address(self) -> str:
@@ -211,11 +211,12 @@ def _fingerprint(folder: Path, option: str) -> str:
             check_regular(path)
         except OSError as error:
             raise UserError(f"{path} can't be read ({error.strerror}): download the model again") from error
-    preprocessing = sorted(folder.glob("p*processor_config.json"))
-    digests = []
-    for path in [config, *preprocessing, *weights]:
-        status = path.stat()
-        digests.append(_digest(path, status.st_size, status.st_mtime_ns))
+    return _digest_of_all([config, *sorted(folder.glob("p*processor_config.json")), *weights])
+
+
+def _digest_of_all(paths: Sequence[Path]) -> str:
+    """Compute 16 hex digits from the contents of files, in their order."""
+    digests = [_digest(path, path.stat().st_size, path.stat().st_mtime_ns) for path in paths]
     return hashlib.sha256("".join(digests).encode()).hexdigest()[:16]
 
 

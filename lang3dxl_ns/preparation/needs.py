@@ -6,7 +6,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -16,7 +15,7 @@ from lang3dxl_ns.common.errors import readable
 from lang3dxl_ns.common.files import read_json
 from lang3dxl_ns.common.reports import markdown_table, write_report
 from lang3dxl_ns.preparation.physical_scale import SCALE_RATIO, CropPlan, crop_sides
-from lang3dxl_ns.scene.colmap import Reconstruction
+from lang3dxl_ns.scene.colmap import Reconstruction, TrackedPhoto
 from lang3dxl_ns.scene.photo import Photo
 from lang3dxl_ns.scene.photometry import measure_photometry
 
@@ -32,6 +31,8 @@ SPREAD_OF_SCALE = "physical widths of the photos, 95th over 5th percentile"
 CUT = 0.01
 """Share of the pixels removed by masks above which the foreground is needed."""
 
+_MASKS = 20
+"""Most masks that are measured, evenly spaced."""
 NEEDS_FILE = "scene_needs"
 
 
@@ -97,12 +98,12 @@ def _measured(
     return Need(component, unmeasured if value is None else value > threshold, measured, value, threshold)
 
 
-def _foreground(photos: Sequence[Photo], at_most: int = 20) -> Need:
+def _foreground(photos: Sequence[Photo]) -> Need:
     masked = [photo for photo in photos if photo.mask_path is not None]
     if not masked:
         return Need("foreground", False, "no masks", None, None)
     cuts = []
-    for photo in masked[:: -(-len(masked) // at_most)]:
+    for photo in masked[:: -(-len(masked) // _MASKS)]:
         mask = photo.read_mask(scale=min(1.0, 256 / max(photo.width, photo.height)))
         if mask is not None:
             cuts.append(1 - float(mask.float().mean()))
@@ -110,7 +111,7 @@ def _foreground(photos: Sequence[Photo], at_most: int = 20) -> Need:
     return _measured("foreground", "share of the pixels removed by masks", value, CUT)
 
 
-def _reprojection_error(photo: Any) -> float | None:
+def _reprojection_error(photo: TrackedPhoto) -> float | None:
     """Average the distances in pixels between a photo's keypoints and projected points; None without any."""
     import cv2
 

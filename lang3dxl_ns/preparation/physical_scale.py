@@ -231,12 +231,12 @@ def plan_crops(
             f"or the scene's median: {some(untracked)}"
         )
     # The reconstruction's sizes are per pixel of the model's photos; a file may be a resized copy.
-    per_file_pixel = {p.name: sizes[p.name] * reconstruction.photos[p.name].width / p.width for p in photos}
-    low, high = np.percentile([per_file_pixel[p.name] * p.width for p in photos], (5, 95))
-    spread = float(high / low)
+    widths = [sizes[photo.name] * reconstruction.photos[photo.name].width for photo in photos]
+    per_file_pixel = {photo.name: width / photo.width for photo, width in zip(photos, widths, strict=True)}
+    low, middle, high = np.percentile(widths, (5, 50, 95)).tolist()
+    spread = high / low
     if config.scale_mode == "auto" and spread <= SCALE_RATIO:
-        width = float(np.median([per_file_pixel[p.name] * p.width for p in photos]))
-        fractions = [scale / width for scale in scales]
+        fractions = [scale / middle for scale in scales]
         reasons.append(f"photos agree in scale: fixed crops of {_listed(fractions)} of their width")
         return CropPlan(fractions, None, spread, reasons)
     return CropPlan(scales, per_file_pixel, spread, reasons)

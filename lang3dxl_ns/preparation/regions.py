@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
@@ -14,7 +13,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from lang3dxl_ns.common.errors import UserError, readable
-from lang3dxl_ns.common.files import read_array
+from lang3dxl_ns.common.files import content_digest, read_array
 from lang3dxl_ns.common.image import fitted_size, resize, resize_nearest
 from lang3dxl_ns.common.options import data_option
 from lang3dxl_ns.common.pictures import NoPictureError, open_picture
@@ -139,11 +138,9 @@ class FolderRegions:
 
     def settings(self, photo: Photo) -> dict[str, Any] | None:
         """Return a hash of the photo's label map; None for a photo without one."""
-        path = self._find(photo.name)
-        if path is None:
+        if (path := self._find(photo.name)) is None:
             return None
-        digest = hashlib.blake2b(path.read_bytes(), digest_size=16).hexdigest()
-        return {"regions": "folder", "file": digest, "rule": _RULE}
+        return {"regions": "folder", "file": content_digest(path), "rule": _RULE}
 
     def labels(self, photo: Photo, image: Float[Tensor, "h w 3"]) -> Int[Tensor, "hl wl"]:
         """Read and undistort the photo's label map. Raises UserError for a file that is not a label map."""

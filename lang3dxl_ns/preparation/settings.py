@@ -101,12 +101,6 @@ class PreparationConfig:
     foreground_model: str = "IDEA-Research/grounding-dino-tiny"
     """Model that finds the prompts, by name or folder: a GroundingDINO, with `sam` for the masks; a CLIPSeg,
     lighter and coarser (CIDAS/clipseg-rd64-refined); or SAM 3, the best (facebook/sam3, gated)."""
-
-    @property
-    def makes_dense(self) -> bool:
-        """Whether the configuration names a dense encoder; False while it is "auto"."""
-        return self.dense not in ("none", "auto")
-
     regions: str = "auto"
     """Segments inside which features should agree: "auto" (regions/ in the data folder, if there is one),
     "none", "sam", "felzenszwalb" (needs no weights), "text" (instances of `region_prompts`, found by a SAM 3
@@ -119,6 +113,11 @@ class PreparationConfig:
     several times as slow; label maps are too small to show much difference."""
     cache_dir: Path | None = None
     """Folder of prepared targets (default: lang3dxl_cache inside the data folder)."""
+
+    @property
+    def makes_dense(self) -> bool:
+        """Whether the configuration names a dense encoder; False while it is "auto"."""
+        return self.dense not in ("none", "auto")
 
     def check(self) -> None:
         """Raise UserError for invalid options, before any work."""

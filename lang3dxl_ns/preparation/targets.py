@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, TypedDict
+from typing import Any, TypedDict, TypeVar
 
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
@@ -15,6 +15,7 @@ from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.preparation.pyramid import ClipTarget
 from lang3dxl_ns.preparation.store import FeatureStore, PhotosGoneError
 
+Read = TypeVar("Read")
 CLIP, FINE, DENSE, REGIONS = "clip", "clip_fine", "dense", "regions"
 _OF_CLIP = {"features": 3, "valid": 2}
 _DIMENSIONS = {CLIP: _OF_CLIP, FINE: _OF_CLIP, DENSE: {"features": 3}, REGIONS: {"labels": 2}}
@@ -87,7 +88,7 @@ class TargetReader:
 
     def clip_features(self, names: Iterable[str]) -> Iterator[Float[Tensor, "hd wd c"]]:
         """Yield the CLIP targets of photos, one at a time, float16, without those that have vanished."""
-        return _readable(lambda name: self.clip(name).features, names)
+        return (target.features for _, target in each_readable(self.clip, names))
 
     def dense(self, name: str) -> Float[Tensor, "t t d"] | None:
         """Read the dense features of the photo squashed to a square, float16; None for a photo without."""
@@ -96,7 +97,7 @@ class TargetReader:
     def dense_features(self, names: Iterable[str]) -> Iterator[Float[Tensor, "t t d"]]:
         """Yield the dense features of those photos that have some, one at a time, float16, without those that
         have vanished."""
-        return (features for features in _readable(self.dense, names) if features is not None)
+        return (features for _, features in each_readable(self.dense, names) if features is not None)
 
     def regions(self, name: str) -> Int[Tensor, "h w"] | None:
         """Read the photo's region labels, −1 for none; None (no file is read) for one without regions."""
@@ -113,10 +114,12 @@ class TargetReader:
         return FeatureStatistics(clip, dense)
 
 
-def _readable(read: Callable[[str], Any], names: Iterable[str]) -> Iterator[Any]:
+def each_readable(read: Callable[[str], Read], names: Iterable[str]) -> Iterator[tuple[str, Read]]:
+    """Read what belongs to photos, and yield it with their names. Those that can't be read are left out, with
+    a message. Raises PhotosGoneError if targets were replaced."""
     for name in names:
         try:
-            yield read(name)
+            yield name, read(name)
         except PhotosGoneError:
             raise
         except UserError as reason:

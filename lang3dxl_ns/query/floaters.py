@@ -15,7 +15,7 @@ from torch import Tensor
 
 from lang3dxl_ns.query.visibility import VisibleGaussians
 from lang3dxl_ns.rendering import Rendering, Splats
-from lang3dxl_ns.scene.camera import Camera, in_camera_frame, resized
+from lang3dxl_ns.scene.camera import Camera, projected, resized
 
 FLOATS = 0.5
 """Score above which a Gaussian counts as a floater."""
@@ -55,9 +55,7 @@ def floating(
 
 def _in_view(splats: Splats, camera: Camera, rendering: Rendering) -> tuple[Tensor, Tensor, Tensor]:
     """Return the rows of Gaussians with centers in a view, their depths, and the depths rendered there."""
-    places = in_camera_frame(camera, splats.means)
-    (fx, _, cx), (_, fy, cy), _ = camera.intrinsics.tolist()
-    x, y = fx * places[:, 0] / places[:, 2] + cx, fy * places[:, 1] / places[:, 2] + cy
-    inside = (places[:, 2] > 0.01) & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
+    x, y, depth = projected(camera, splats.means).unbind(1)
+    inside = (depth > 0.01) & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
     rows = inside.nonzero().squeeze(1)
-    return rows, places[rows, 2], rendering.depth[y[rows].long(), x[rows].long()]
+    return rows, depth[rows], rendering.depth[y[rows].long(), x[rows].long()]

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lang3dxl_ns.query.visibility import VisibleGaussians
-from lang3dxl_ns.scene.camera import Camera, in_camera_frame
+from lang3dxl_ns.scene.camera import Camera, projected
 
 OUTLIERS = 0.02
 """Share of a match's points that its box excludes at either end of each axis."""
@@ -178,10 +178,6 @@ def _peak(view: VisibleGaussians, scores: Float[Tensor, " n"]) -> Float[Tensor, 
 
 def _centeredness(view: VisibleGaussians, means: Float[Tensor, "n 3"]) -> Float[Tensor, " m"]:
     """Compute weights of 1 for Gaussians in the middle half of a view, falling to `RIM` at its rim."""
-    camera = view.camera
-    points = in_camera_frame(camera, means[view.rows])
-    (fx, _, cx), (_, fy, cy), _ = camera.intrinsics.tolist()
-    x, y = (points[:, axis] / points[:, 2] for axis in (0, 1))
-    across, down = 2 * (x * fx + cx) / camera.width - 1, 2 * (y * fy + cy) / camera.height - 1
-    off = torch.maximum(across.abs(), down.abs())
+    x, y, _ = projected(view.camera, means[view.rows]).unbind(1)
+    off = torch.maximum((2 * x / view.camera.width - 1).abs(), (2 * y / view.camera.height - 1).abs())
     return 1 - (1 - RIM) * ((off - 0.5) / 0.5).nan_to_num(1.0).clamp(0, 1)

@@ -127,7 +127,9 @@ def add_photos(
     words = reasons_in_words({"without a place": lost, "doubtfully placed": doubtful})
     if not found:
         raise UserError(f"none of the {len(targets)} new photos can be placed; {'; '.join(words)}")
-    _copy(images, {name: target for name, target in targets.items() if name in found})
+    for name in found:
+        if not (images / targets[name]).exists():
+            _copied(images / name, images / targets[name])
     for image in numbers.values():
         model.extract_colors_for_image(image, images)  # only of points without a color
     told = read_report(work.parent, place)
@@ -172,13 +174,6 @@ def _pairs_of(model: pycolmap.Reconstruction) -> set[tuple[str, str]]:
     enough = shared.data >= LEAST_MATCHES
     found = zip(shared.row[enough].tolist(), shared.col[enough].tolist(), strict=True)
     return {(names[i], names[j]) for i, j in found}
-
-
-def _copy(images: Path, targets: Mapping[str, str]) -> None:
-    """Copy new photos beside the scene's, unless they are there."""
-    for name, target in targets.items():
-        if not (images / target).exists():
-            _copied(images / name, images / target)
 
 
 def _targets(folder: Path, images: Path, known: set[str]) -> dict[str, str]:

@@ -213,6 +213,14 @@ def in_camera_frame(camera: Camera, points: Float[Tensor, "n 3"]) -> Float[Tenso
     return points @ view[:3, :3].T + view[:3, 3]
 
 
+def projected(camera: Camera, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+    """Project points of the world to a view: column and row in pixels, and depth. Behind the camera, only
+    the depth has a meaning."""
+    seen = in_camera_frame(camera, points)
+    lens = to_device(camera.intrinsics.to(seen.dtype), seen.device)
+    return torch.cat([(seen / seen[:, 2:]) @ lens[:2].T, seen[:, 2:]], dim=1)
+
+
 @torch.no_grad()
 def in_view(camera: Camera, means: Float[Tensor, "n 3"], scales: Float[Tensor, "n 3"]) -> Bool[Tensor, " n"]:
     """Return which Gaussians may be visible: all that are, and some that aren't. The ball of 3.5 standard

@@ -172,11 +172,7 @@ class Capture:
         """Similarity to training's coordinates from the original ones, which a transforms.json may have
         moved."""
         moved = self.transforms
-        if moved is None or (moved.applied is None and moved.applied_scale == 1):
-            return self.frame
-        return self.frame.after(
-            np.eye(4)[:3] if moved.applied is None else moved.applied, moved.applied_scale
-        )
+        return self.frame if moved is None else self.frame.after(moved.applied, moved.applied_scale)
 
     def poses(self, names: Sequence[str]) -> Float32[Array, "n 3 4"]:
         """Compute photos' poses in training's frame (camera → world; x right, y up, z backward)."""
@@ -206,10 +202,10 @@ def open_capture(
 
     Args:
         data: folder with a COLMAP model, with a transforms.json, or with photos alone; or a transforms.json,
-            or a video. Photos without poses are reconstructed, which takes minutes. settings: where its parts
-            are, and how it is split and normalized. cache_dir: folder of a reconstruction, if not
-            lang3dxl_cache in the folder. may_reconstruct: whether photos may be reconstructed, and frames of
-            a video extracted.
+            or a video. Photos without poses are reconstructed, which takes minutes.
+        settings: where its parts are, and how it is split and normalized.
+        cache_dir: folder of a reconstruction, if not lang3dxl_cache in the folder.
+        may_reconstruct: whether photos may be reconstructed, and frames of a video extracted.
 
     Raises:
         UserError: there are no photos, or none of them can be used, or the file with their cameras is

@@ -10,7 +10,7 @@ from __future__ import annotations
 import re
 import struct
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -219,24 +219,18 @@ def _text_photos(path: Path, content: bytes) -> list[ModelPhoto]:
     """Read photos. Each has a line, and its keypoints have the next one, which may be missing or blank: a
     line of numbers only whose count is a multiple of three is one of keypoints."""
     photos: list[ModelPhoto] = []
-    keypoints: dict[int, Float[Array, "n 3"]] = {}
     for number, line in _lines(content):
-        seen = _numbers(line)
-        if seen is not None and len(seen) % 3 == 0:
-            if not photos or len(photos) - 1 in keypoints:
-                raise _bad(path, number, line, "has keypoints of no photo")
-            keypoints[len(photos) - 1] = seen.reshape(-1, 3)
+        numbers = _numbers(line)
+        if numbers is None or len(numbers) % 3:
+            photos.append(_text_photo(path, number, line, numbers_only=numbers is not None))
+        elif not photos or len(photos[-1].points):
+            raise _bad(path, number, line, "has keypoints of no photo")
         else:
-            photos.append(_text_photo(path, number, line, numbers_only=seen is not None))
-    nothing = np.zeros((0, 3))
-    return [
-        ModelPhoto(p.number, p.name, p.quaternion, p.translation, p.camera, seen[:, :2], _ids(seen[:, 2]))
-        for p, seen in ((photo, keypoints.get(i, nothing)) for i, photo in enumerate(photos))
-    ]
-
-
-def _ids(values: Float[Array, " n"]) -> Int64[Array, " n"]:
-    return np.where(np.isfinite(values) & (np.abs(values) < 2**53), values, -1).astype(np.int64)
+            seen = numbers.reshape(-1, 3)
+            known = np.abs(seen[:, 2]) < 2**53  # NaN is not
+            points = np.where(known, seen[:, 2], -1).astype(np.int64)
+            photos[-1] = replace(photos[-1], pixels=seen[:, :2], points=points)
+    return photos
 
 
 def _numbers(line: str) -> Float[Array, " n"] | None:

@@ -38,13 +38,12 @@ _MARKS = {"*.xmp": "capturingreality", "metadata.json": '"poses"'}
 
 def has_model(folder: Path) -> bool:
     """Return whether a folder has a file of photos of a COLMAP model."""
-    return any((folder / f"images{ending}").is_file() for ending in (".bin", ".txt"))
+    return _has_one_of(folder, "images")
 
 
-def _has_more(folder: Path) -> bool:
-    """Return whether a folder has another file of a COLMAP model than that of photos."""
-    parts = (f"{part}{ending}" for part in ("cameras", "points3D") for ending in (".bin", ".txt"))
-    return any((folder / part).is_file() for part in parts)
+def _has_one_of(folder: Path, *parts: str) -> bool:
+    """Return whether a folder has the file of one of these parts of a COLMAP model."""
+    return any((folder / f"{part}{ending}").is_file() for part in parts for ending in (".bin", ".txt"))
 
 
 def whole_scene(folder: Path) -> Path:
@@ -84,21 +83,16 @@ def find_model(folder: Path) -> Path | None:
     said with the others; None without one."""
     for place in MODEL_FOLDERS:
         # Among photos, images.txt may as well be a list of their addresses.
-        if has_model(folder / place) and (place.name or _has_more(folder)):
+        if has_model(folder / place) and (place.name or _has_one_of(folder, "cameras", "points3D")):
             return folder / place
-    found = {model: photos_in_model(model) for model in _models_below(folder)}
+    models = (here for here in _searched(folder) if has_model(here) and _has_one_of(here, "cameras"))
+    found = {model: photos_in_model(model) for model in models}
     if not found:
         return None
     best = max(found, key=lambda model: (found[model], -len(model.parts)))
     told = ", ".join(f"{os.path.relpath(model, folder)} with {count}" for model, count in found.items())
     say(f"{folder} has a COLMAP model in {os.path.relpath(best, folder)}, which is used (photos: {told})")
     return best
-
-
-def _models_below(folder: Path) -> Iterator[Path]:
-    for here in _searched(folder):
-        if has_model(here) and any((here / f"cameras{ending}").is_file() for ending in (".bin", ".txt")):
-            yield here
 
 
 def _searched(folder: Path) -> Iterator[Path]:

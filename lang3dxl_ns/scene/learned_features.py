@@ -25,6 +25,7 @@ from lang3dxl_ns.common.console import progress
 from lang3dxl_ns.common.device import best_device
 from lang3dxl_ns.common.pictures import eight_bits, open_picture
 from lang3dxl_ns.scene.colmap import load_pycolmap
+from lang3dxl_ns.scene.pairing import best_pairs
 
 ALIKE = 0.82
 """Cosine of mutual nearest descriptors from which they count as a possible match."""
@@ -150,13 +151,9 @@ def alike_pairs(photos: Mapping[str, Features]) -> list[tuple[str, str]]:
             for j in range(i):
                 counts[i, j] = counts[j, i] = possible_matches(best[i], best[j])
             advance(1)
-    order = np.argsort(-counts, axis=1, kind="stable")
-    chosen = set()
-    for i in range(len(names)):
-        for place, j in enumerate(order[i][: min(NEIGHBORS, len(names) - 1)].tolist()):
-            if i != j and (place < PARTNERS or counts[i, j] >= LEAST_ALIKE):
-                chosen.add((names[min(i, j)], names[max(i, j)]))
-    return sorted(chosen)
+    ranked = counts + 1 - np.eye(len(names), dtype=int)  # above 0 for all other photos: each has its partners
+    likely = np.where(counts >= LEAST_ALIKE, counts, 0)
+    return sorted({*best_pairs(names, ranked, PARTNERS), *best_pairs(names, likely, NEIGHBORS)})
 
 
 def possible_matches(first: Float[Tensor, "n c"], second: Float[Tensor, "m c"]) -> int:

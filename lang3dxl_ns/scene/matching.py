@@ -5,7 +5,6 @@ Both are stored as they are made, so that an interrupted reconstruction can be r
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import shutil
@@ -23,7 +22,7 @@ from numpy import ndarray as Array
 
 from lang3dxl_ns.common.console import progress, say, some
 from lang3dxl_ns.common.errors import DAMAGE, UserError, is_plain
-from lang3dxl_ns.common.files import check_room, read_json, replace_file
+from lang3dxl_ns.common.files import check_room, content_digest, read_json, replace_file
 from lang3dxl_ns.common.memory import machine_memory
 from lang3dxl_ns.common.options import data_option
 from lang3dxl_ns.common.pictures import open_picture
@@ -103,7 +102,6 @@ def feature_database(
 ) -> Path:
     """Make the database of photos and cameras, or reuse one with the same photos and settings. A new one has
     the features of photos whose bytes an older one knows, here or in the folders `earlier`."""
-    pycolmap = load_pycolmap()
     number = dict(zip(photos.names, copies.names, strict=True))
     paths = {name: photos.folder / name for name in photos.names}
     told = [(name, path.stat().st_size, _digest(path), number[name]) for name, path in paths.items()]
@@ -117,20 +115,7 @@ def feature_database(
     importing = work / "importing.db"
     for old in work.glob("importing.db*"):
         old.unlink()
-    pycolmap.Database.open(importing).close()
-    groups = shared_cameras(photos)
-    if settings.one_camera is not None:
-        groups = [list(photos.names)] if settings.one_camera else [[name] for name in photos.names]
-    for group in groups:
-        numbers = [number[name] for name in group]
-        pycolmap.import_images(importing, copies.folder, pycolmap.CameraMode.SINGLE, numbers)
-    _correct_lenses(importing)
-    if settings.one_camera:  # COLMAP passes over photos of another size, and later gives each its own
-        with pycolmap.Database.open(importing) as db:
-            odd = [name for name in photos.names if not db.exists_image(number[name])]
-        if odd:
-            several = f"{some(odd)} can't share the camera of {photos.names[0]}, which has another size"
-            raise UserError(f"{several}: lang3dxl reconstruct without --one-camera, or without them")
+    _import(importing, photos, copies, settings.one_camera)
     wanted = {content: name for *_, content, name in told}
     for folder in (work, *earlier):
         _keep_features(folder, importing, wanted, made)
@@ -142,6 +127,26 @@ def feature_database(
     importing.rename(database)
     replace_file(stamped, stamp)
     return database
+
+
+def _import(database: Path, photos: PhotoFolder, copies: PhotoFolder, one_camera: bool | None) -> None:
+    """Make a database of photos and the cameras that took them. Raises UserError if one camera can't have
+    taken all."""
+    pycolmap, number = load_pycolmap(), dict(zip(photos.names, copies.names, strict=True))
+    pycolmap.Database.open(database).close()
+    groups = shared_cameras(photos)
+    if one_camera is not None:
+        groups = [list(photos.names)] if one_camera else [[name] for name in photos.names]
+    for group in groups:
+        numbers = [number[name] for name in group]
+        pycolmap.import_images(database, copies.folder, pycolmap.CameraMode.SINGLE, numbers)
+    _correct_lenses(database)
+    if one_camera:  # COLMAP passes over photos of another size, and later gives each its own
+        with pycolmap.Database.open(database) as db:
+            odd = [name for name in photos.names if not db.exists_image(number[name])]
+        if odd:
+            several = f"{some(odd)} can't share the camera of {photos.names[0]}, which has another size"
+            raise UserError(f"{several}: lang3dxl reconstruct without --one-camera, or without them")
 
 
 def _correct_lenses(database: Path) -> None:
@@ -363,7 +368,7 @@ def _digest(path: Path) -> str:
 
 @cache  # duplicates are looked for, then features that are kept
 def _read_digest(path: Path, size: int, changed: int) -> str:
-    return hashlib.blake2b(path.read_bytes(), digest_size=16).hexdigest()
+    return content_digest(path)
 
 
 def _threads(memory_each: float) -> int:

@@ -56,7 +56,7 @@ def similar_pairs(
             counts[i, i + 1 :] = _possible_matches(rows[i], rows[i + 1 :])
             counts[i + 1 :, i] = counts[i, i + 1 : len(new)]
             advance(1)
-    return _best_pairs(names, counts, ALIKE)
+    return best_pairs(names, counts, ALIKE)
 
 
 def pairs_that_share(
@@ -69,10 +69,10 @@ def pairs_that_share(
     for table, pairs in ((done, tried), (matches, matched)):
         for one, other in pairs:
             table[number[one], number[other]] = table[number[other], number[one]] = 1
-    return _best_pairs(names, (matches @ matches * ~done).astype(int), SHARING)
+    return best_pairs(names, (matches @ matches * ~done).astype(int), SHARING)
 
 
-def _best_pairs(names: Sequence[str], scores: Int[Array, "m n"], count: int) -> list[tuple[str, str]]:
+def best_pairs(names: Sequence[str], scores: Int[Array, "m n"], count: int) -> list[tuple[str, str]]:
     """Pair each of the first m photos with the `count` of the highest positive score."""
     best = np.argsort(-scores, axis=1, kind="stable")[:, :count]
     found = ((i, j) for i, others in enumerate(best.tolist()) for j in others if scores[i, j] > 0)

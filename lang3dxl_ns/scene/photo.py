@@ -6,7 +6,6 @@ pixels as stored. So pixels, lens and pose of a model's photo are turned togethe
 
 from __future__ import annotations
 
-import hashlib
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -23,6 +22,7 @@ from PIL import ExifTags, Image
 from torch import Tensor
 
 from lang3dxl_ns.common.errors import UserError
+from lang3dxl_ns.common.files import content_digest
 from lang3dxl_ns.common.pictures import NoPictureError, mask_values, open_picture, rgb_pixels, see_through
 from lang3dxl_ns.scene.camera import HasLens, Lens, scaled_size
 
@@ -135,7 +135,7 @@ class Photo(HasLens):
     def content_hash(self) -> str:
         """Compute a hash of the file's bytes, without camera and mask."""
         with _readable(self.path, self.name):
-            return hashlib.blake2b(self.path.read_bytes(), digest_size=16).hexdigest()
+            return content_digest(self.path)
 
     def _decoded(self, at_least: tuple[int, int]) -> Image.Image:
         """Decode the file to 8-bit RGB without alpha, upright and still distorted. A large JPEG may be

@@ -99,9 +99,8 @@ def matched_pairs(database: pycolmap.Database, cameras: Mapping[int, pycolmap.Ca
         if count >= LEAST_MATCHES and first in cameras and second in cameras:
             ends = np.asarray(database.read_two_view_geometry(first, second).inlier_matches)
             matched.append((first, second, ends))
-    with (
-        ThreadPool() as cores
-    ):  # COLMAP's library lets others go on meanwhile; Ctrl+C waits for no other pair
+    # COLMAP's library lets other threads go on meanwhile, and Ctrl+C waits for no other pair.
+    with ThreadPool() as cores:
         return [*filter(None, tracked(cores.imap(measured, matched), "pairs measured", len(matched)))]
 
 

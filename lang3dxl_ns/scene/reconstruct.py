@@ -1,7 +1,7 @@
 """Structure from motion: from a folder of photos to cameras, poses and points, with COLMAP's library.
 
-Features and matches outlive an interruption (`matching`), and of mapping every hundred photos; the model is
-written only when it is complete.
+Features and matches outlive an interruption (`matching`), and so does what every hundred photos of mapping
+gave. The model is written only when it is complete.
 """
 
 from __future__ import annotations
@@ -174,7 +174,7 @@ def _best_mapping(
 ) -> _Mapping:
     """Map so many photos, and where plain SIFT leaves many without a pose, map again with stronger features.
 
-    Not where sides look alike to SIFT: stronger features put photos on the wrong one."""
+    Where sides look alike to SIFT, the first models stay: stronger features put photos on the wrong side."""
     if settings.features != "auto":
         return mapped(work, settings)
     plain = mapped(work, replace(settings, features="sift"))

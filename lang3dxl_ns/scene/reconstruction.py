@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -11,7 +10,7 @@ from typing import Any, Literal
 
 from lang3dxl_ns.common.console import some
 from lang3dxl_ns.common.errors import DAMAGE
-from lang3dxl_ns.common.files import read_json
+from lang3dxl_ns.common.files import content_digest, read_json
 
 REPORT = Path("reconstruction/report.json")
 """File of the report in a scene's cache."""
@@ -140,5 +139,4 @@ def doubtful_photos(cache_dir: Path, model: Path) -> dict[str, str]:
 def model_digest(model: Path) -> str:
     """Compute a digest of the photos of a model, with their poses and keypoints. Raises OSError without."""
     path = model / "images.bin"
-    content = (path if path.is_file() else path.with_suffix(".txt")).read_bytes()
-    return hashlib.blake2b(content, digest_size=16).hexdigest()
+    return content_digest(path if path.is_file() else path.with_suffix(".txt"))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -54,13 +54,13 @@ class Transforms:
     """Photos that can't be used, by the name in the file, with reasons."""
     points: Float64[Array, "m 3"]
     colors: UInt8[Array, "m 3"]
-    train: frozenset[str] | None = None
+    train: frozenset[str] | None
     """Files that it lists for training; None: it lists none."""
-    held_out: frozenset[str] | None = None
+    held_out: frozenset[str] | None
     """Files that it lists for validation and tests."""
-    applied: Float64[Array, "3 4"] | None = None
+    applied: Float64[Array, "3 4"]
     """Transform that was applied to the original coordinates, before `applied_scale`."""
-    applied_scale: float = 1.0
+    applied_scale: float
 
 
 def read_transforms(path: Path) -> Transforms:
@@ -71,9 +71,9 @@ def read_transforms(path: Path) -> Transforms:
     with readable(f"{path} can't be used", "correct it, or make it again"):
         frames = content["frames"]
         expect(bool(frames), "it lists no photo under frames")
-        applied, scale = content.get("applied_transform"), content.get("applied_scale", 1.0)
-        if applied is not None:
-            check_pose(applied)
+        applied = content.get("applied_transform") or np.eye(4).tolist()
+        scale = content.get("applied_scale", 1.0)
+        check_pose(applied)
         expect(is_coordinate(scale) and scale > 0, f"applied_scale is {str(scale)[:40]}")
         points, colors = _points(content.get("ply_file_path"), path)
         found, files = _photos(path.parent, content, frames)
@@ -82,7 +82,7 @@ def read_transforms(path: Path) -> Transforms:
     held_out = [names for names in others if names is not None]
     return Transforms(
         *found, points, colors, train, frozenset[str]().union(*held_out) if held_out else None,
-        None if applied is None else np.array(applied, np.float64)[:3], float(scale),
+        np.array(applied, np.float64)[:3], float(scale),
     )  # fmt: skip
 
 
@@ -166,7 +166,7 @@ def _alike(one: TrackedPhoto, other: TrackedPhoto) -> bool:
 
 
 def _resolved(
-    folder: Path, names: list[str], what: str, files: Any
+    folder: Path, names: list[str], what: str, files: Callable[[Path], Iterable[str]]
 ) -> tuple[dict[str, str], dict[str, UserError]]:
     """Find the files of names, which may be absolute, have slashes of Windows, and lack their ending. Names
     that lead out of the folder, also by a link in it, are refused."""
@@ -273,7 +273,7 @@ def _size(frame: Mapping[str, Any], path: Path, name: str) -> tuple[int, int]:
 
 
 def _focal(frame: Mapping[str, Any], width: int, height: int) -> tuple[float, float, float, float]:
-    """Return fx, fy, cx, cy. Angles of view may stand for focal lengths."""
+    """Return fx, fy, cx, cy. Angles of view may stand for focal lengths, and one axis for both."""
 
     def along(axis: str, side: int) -> float | None:
         if f"fl_{axis}" in frame:
@@ -285,15 +285,13 @@ def _focal(frame: Mapping[str, Any], width: int, height: int) -> tuple[float, fl
                 return side / 2 / math.tan(angle / 2)
         return None
 
-    fx, fy = along("x", width), along("y", height)
-    if fx is None and fy is None:
+    known = [focal for focal in (along("x", width), along("y", height)) if focal is not None]
+    if not known:
         raise KeyError("fl_x or camera_angle_x")
-    fx, fy = fx if fx is not None else fy, fy if fy is not None else fx
-    assert fx is not None and fy is not None
     cx, cy = (
         _number(frame, key) if key in frame else side / 2 for key, side in (("cx", width), ("cy", height))
     )
-    return fx, fy, cx, cy
+    return known[0], known[-1], cx, cy
 
 
 def _distortion(frame: Mapping[str, Any], model: str, fisheye: bool, name: str) -> tuple[float, ...]:

@@ -25,9 +25,8 @@ from lang3dxl_ns.scene.companions import cache_folder
 VIDEO_SUFFIXES = (
     *(".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mts", ".m2ts", ".ts", ".mpg", ".mpeg", ".3gp"),
 )
-FRAMES_PER_SECOND = 2.0
-MOST_FRAMES = 300
-"""Maximum number of frames; the rate is reduced for a long video."""
+_PER_SECOND, _MOST_FRAMES = 2.0, 300
+"""Frames of each second, and of a whole video, at most: those of a long one are farther apart."""
 _LOOK = (240, 135)  # pixels at which sharpness is judged; motion blur is visible there too
 _COARSE = 15  # pixels of these that are averaged along each side to see change
 _MOST_CHANGE = 95
@@ -63,10 +62,10 @@ def frames_folder(video: Path) -> Path:
     return video.with_name(f"{video.stem}_photos")
 
 
-def extract_frames(video: Path, rate: float = FRAMES_PER_SECOND, most: int = MOST_FRAMES) -> Path:
-    """Write the sharpest frame of every interval of 1/`rate` seconds to `frames_folder`/images, upright,
-    unless an earlier call did. Raises UserError without ffmpeg, for a file that is no video or a very short
-    one, and for a folder with the frames of another video."""
+def extract_frames(video: Path) -> Path:
+    """Write the sharpest frame of every half second to `frames_folder`/images, upright, unless an earlier
+    call did. Raises UserError without ffmpeg, for a file that is no video or a very short one, and for a
+    folder with the frames of another video."""
     folder = frames_folder(video)
     made_of = folder / "lang3dxl_cache" / "video.json"
     this = known = [video.name, video.stat().st_size] if video.is_file() else None
@@ -82,11 +81,11 @@ def extract_frames(video: Path, rate: float = FRAMES_PER_SECOND, most: int = MOS
             "ffmpeg), or give a folder of frames"
         )
     duration = _duration(video)
-    stretches = max(1, min(most, int(duration * rate + 0.01)))  # times are rounded
+    stretches = max(1, min(_MOST_FRAMES, int(duration * _PER_SECOND + 0.01)))  # times are rounded
     say(f"{video.name}: {duration:.0f} s, the sharpest frame of each of {stretches} intervals")
     with locked(folder, busy=f"another command writes frames into {folder}: wait for it, or end it"):
         if (folder / "images").is_dir():  # another command has just written them
-            return extract_frames(video, rate, most)
+            return extract_frames(video)
         cache_folder(folder, None)  # a link is not written through
         sharpness, change = _looks(video)
         if len(sharpness) < 3:

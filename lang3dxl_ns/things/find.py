@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 
 import numpy as np
 import torch
@@ -22,7 +21,7 @@ from lang3dxl_ns.query.text import Prompt, caution
 from lang3dxl_ns.query.trust import FAR
 from lang3dxl_ns.query.vocabulary import searched, shipped_vocabulary, singular
 from lang3dxl_ns.rendering import composite, harmonics_of
-from lang3dxl_ns.scene.camera import in_camera_frame
+from lang3dxl_ns.scene.camera import projected
 from lang3dxl_ns.things.join import VIEWS, Joined, grown, join, parted, placed, without_crumbs
 from lang3dxl_ns.things.pieces import FILLED, LEVELS, Piece, Shown, pieces_of
 from lang3dxl_ns.things.thing import Box, Sighting, Thing, upright_box
@@ -97,8 +96,6 @@ def things_of(scene: Answering, question: Question) -> list[Things]:
     they separate neighbors: the wall between two windows that CLIP sees as one.
     """
     question = _in_singular(scene, question)
-    mass = scene.mass.double().cpu().numpy()
-    means, axes = scene.splats.means.double().cpu().numpy(), axes_of(scene)
     colors = harmonics_of(scene.baked().colors(scene.overview.camera.position).clamp(0, 1))[:, 0]
     colors = colors.nan_to_num()  # of Gaussians that lie nowhere
     sharp = [_sharpened(scene, relevancy, colors.cpu().numpy()) for relevancy in question.relevancy]
@@ -109,36 +106,57 @@ def things_of(scene: Answering, question: Question) -> list[Things]:
         for found, view, best in zip(pieces, views, peak, strict=True):
             shown[view.photo] = view.rows
             found += pieces_of(view) if best > LEVELS[0] else []
+    axes = axes_of(scene)
+    return [_answer(scene, question, row, own, shown, axes) for row, own in enumerate(pieces)]
 
-    def box(weight: Float[Array, " n"], one: Joined) -> Box:
+
+def _answer(
+    scene: Answering,
+    question: Question,
+    row: int,
+    pieces: Sequence[Piece],
+    shown: Mapping[str, Int[Array, " m"]],
+    axes: Float[Array, "3 3"],
+) -> Things:
+    """Find the things of the question's prompt in a row. `shown`: the Gaussians that each photo shows;
+    `axes`: directions of all boxes' edges."""
+    prompt, values = question.prompts[row], question.relevancy[row].double().cpu().numpy()
+    mass, means = scene.mass.double().cpu().numpy(), scene.splats.means.double().cpu().numpy()
+    weight = np.sqrt(mass) * values
+
+    def box(one: Joined) -> Box:
         return upright_box(means[one.rows], weight[one.rows], axes)
 
-    answers, shown_in = list[Things](), sum(len(view.rows) > 0 for view in scene.visible.values())
-    for i, prompt in enumerate(question.prompts):
-        values = question.relevancy[i].double().cpu().numpy()
-        weight = np.sqrt(mass) * values
-        boxed = partial(box, weight)
-        whole = grown(join(pieces[i], weight, boxed, shown), len(weight))
-        parts = parted(whole, means @ axes[:2].T, weight, APART * scene.gap)
-        joined = sorted(placed(parts, [boxed(part) for part in parts]), key=lambda one: -one.weight)
-        seen = [one for one in without_crumbs(joined) if one.views >= VIEWS]
-        sure = [one for one in seen if prompt.taught or values[one.rows].max() >= PRESENT]
-        better = {} if prompt.taught else better_words(scene, prompt, sure, (weight * values) ** 2)
-        sure = [one for one in sure if one not in better]
-        rest = [one for one in joined if one not in sure]
-        things, candidates = (
-            [_thing(prompt.name, one, boxed(one), mass, values) for one in some] for some in (sure, rest)
-        )
-        trust, far = question.trusts[i], (scene.foreignness or 0) >= FAR and prompt.taught is None
-        told = [trust.reason, trust.remedy] if far or trust.level != "sure" else []
-        if better and not things:
-            told = [f"what was found fits {next(iter(better.values()))!r} better"]
-        if shown_in < VIEWS:
-            shows = "one training photo shows" if shown_in else "no training photo shows"
-            told = [f"{shows} the scene, and a thing is what two show"]
-        told += [] if prompt.taught else [caution(prompt.text, counted=True) or ""]
-        answers.append(Things(prompt.name, things, candidates, "; ".join(filter(None, told)) or None))
-    return answers
+    whole = grown(join(pieces, weight, box, shown), len(weight))
+    parts = parted(whole, means @ axes[:2].T, weight, APART * scene.gap)
+    joined = sorted(placed(parts, [box(part) for part in parts]), key=lambda one: -one.weight)
+    seen = [one for one in without_crumbs(joined) if one.views >= VIEWS]
+    sure = [one for one in seen if prompt.taught or values[one.rows].max() >= PRESENT]
+    better = {} if prompt.taught else better_words(scene, prompt, sure, (weight * values) ** 2)
+    sure = [one for one in sure if one not in better]
+    rest = [one for one in joined if one not in sure]
+    things, candidates = (
+        [_thing(prompt.name, one, box(one), mass, values) for one in some] for some in (sure, rest)
+    )
+    instead = next(iter(better.values()), None) if not things else None
+    return Things(prompt.name, things, candidates, _caution(scene, question, row, instead))
+
+
+def _caution(scene: Answering, question: Question, row: int, instead: str | None) -> str | None:
+    """Say why the answer to a prompt is doubtful, or counts are, what helps, and what is not used of the
+    prompt; None if nothing is to say. `instead`: the word that all that was found fits better; None if some
+    of it fits the prompt."""
+    prompt, trust = question.prompts[row], question.trusts[row]
+    shown_in = sum(len(view.rows) > 0 for view in scene.visible.values())
+    far = (scene.foreignness or 0) >= FAR and prompt.taught is None
+    told: list[str | None] = [trust.reason, trust.remedy] if far or trust.level != "sure" else []
+    if instead is not None:
+        told = [f"what was found fits {instead!r} better"]
+    if shown_in < VIEWS:
+        shows = "one training photo shows" if shown_in else "no training photo shows"
+        told = [f"{shows} the scene, and a thing is what two show"]
+    told += [] if prompt.taught else [caution(prompt.text, counted=True)]
+    return "; ".join(filter(None, told)) or None
 
 
 def _in_singular(scene: Answering, question: Question) -> Question:
@@ -244,23 +262,20 @@ def _sharpened(scene: Answering, relevancy: Float[Tensor, " n"], colors: Array) 
 @torch.no_grad()
 def _views(scene: Answering, heat: Float[Tensor, "n q"]) -> Iterator[list[Shown]]:
     """Render each training view's heat maps at the size that it was trained at."""
-    means, splats = scene.splats.means, scene.splats
     for name, view in scene.visible.items():
         photo = scene.file.photo(name)
         camera = photo.camera
-        seen = in_camera_frame(camera, means)
-        lit = torch.cat([heat.to(means), torch.ones_like(seen[:, 2:])], 1)
-        drawn = composite(splats, camera, torch.cat([lit, lit * seen[:, 2:]], 1))
+        points = projected(camera, scene.splats.means)
+        lit = torch.cat([heat.to(points), torch.ones_like(points[:, 2:])], 1)
+        drawn = composite(scene.splats, camera, torch.cat([lit, lit * points[:, 2:]], 1))
         maps, depths = np.split(np.moveaxis(drawn.cpu().numpy(), 2, 0), 2)
         inside = photo.foreground((camera.height, camera.width))
         keep = 1.0 if inside is None else inside.numpy()
-        rows = view.rows[view.pixels >= FILLED].long().cpu().numpy()
-        points = seen.cpu().numpy()[rows]
-        lens = camera.intrinsics.cpu().numpy()
-        points = np.column_stack([(points / points[:, 2:]) @ lens[:2].T, points[:, 2]])
+        rows = view.rows[view.pixels >= FILLED].long()
+        shown, numbers, focal = points[rows].cpu().numpy(), rows.cpu().numpy(), float(camera.intrinsics[0, 0])
         *matched, surface = depths / np.maximum(maps, 1e-4)
         yield [
-            Shown(name, one, surface, depth, rows, points, float(lens[0, 0]))
+            Shown(name, one, surface, depth, numbers, shown, focal)
             for one, depth in zip(maps[:-1] * keep, matched, strict=True)
         ]
 

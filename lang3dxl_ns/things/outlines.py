@@ -15,7 +15,7 @@ from scipy.spatial import ConvexHull
 from lang3dxl_ns.query.heat_maps import PROMPT_COLORS
 from lang3dxl_ns.query.match import as_bytes
 from lang3dxl_ns.rendering import Rendering, Splats, composite
-from lang3dxl_ns.scene.camera import Camera, in_camera_frame
+from lang3dxl_ns.scene.camera import Camera, projected
 from lang3dxl_ns.things.find import Things
 from lang3dxl_ns.things.thing import Thing
 
@@ -67,12 +67,10 @@ def shown(
     """Yield the things of one word that a view shows, each with its number and the middle of its pixels
     (column and row): those that it shows at a quarter of the places of some of their Gaussians."""
     (pixels,) = held(splats, camera, [things])
-    lens = camera.intrinsics.cpu().numpy()
     for number, thing in enumerate(things, start=1):
         rows = np.sort(thing.rows)[:: 1 + (len(thing.rows) - 1) // PLACES]
-        seen = in_camera_frame(camera, splats.means[rows]).cpu().numpy()
-        x, y = np.floor((seen / seen[:, 2:]) @ lens[:2].T).T
-        inside = (seen[:, 2] > 0) & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
+        x, y, depth = projected(camera, splats.means[rows]).cpu().numpy().T
+        inside = (depth > 0) & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
         own = pixels[y[inside].astype(int), x[inside].astype(int)] == number
         if own.any() and own.mean() >= SHOWN:
             row, column = (int(np.median(side)) for side in (pixels == number).nonzero())
@@ -83,17 +81,16 @@ def outlined(splats: Splats, answers: Sequence[Things], rendering: Rendering) ->
     """Draw the boxes of the things that a rendering of the splats shows, each once, in its first word's color
     and with its number there."""
     picture, camera = Image.fromarray(as_bytes(rendering.rgb)), rendering.camera
-    pen, lens = ImageDraw.Draw(picture), camera.intrinsics.cpu().numpy()
+    pen = ImageDraw.Draw(picture)
     first = {thing.id: which for which, _, thing in numbered(answers)}
     for which, one in enumerate(answers):
         color = PROMPT_COLORS[which % len(PROMPT_COLORS)]
         for number, thing, middle in shown(splats, camera, one.things):
             corners = torch.from_numpy(thing.center + (_CORNERS * thing.size) @ thing.axes)
-            seen = in_camera_frame(camera, corners).cpu().numpy()
+            seen = projected(camera, corners).cpu().numpy()
             if first[thing.id] != which or seen[:, 2].min() < 1e-2 * thing.size.max():
                 continue  # under an earlier word, or around the camera
-            pixels = (seen / seen[:, 2:]) @ lens[:2].T
-            around = pixels[ConvexHull(pixels, qhull_options="QJ").vertices]
+            around = seen[ConvexHull(seen[:, :2], qhull_options="QJ").vertices, :2]
             pen.polygon(around.ravel().tolist(), outline=color, width=2)
             pen.text(middle, str(number), color, anchor="mm", stroke_width=1, stroke_fill="white")
     return np.asarray(picture)

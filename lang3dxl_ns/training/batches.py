@@ -27,7 +27,7 @@ from lang3dxl_ns.preparation.prepare import prepare
 from lang3dxl_ns.preparation.regions import RegionSource, region_source
 from lang3dxl_ns.preparation.settings import PreparationConfig
 from lang3dxl_ns.preparation.store import FeatureStore, PhotosGoneError
-from lang3dxl_ns.preparation.targets import Batch, SceneFacts, TargetReader
+from lang3dxl_ns.preparation.targets import Batch, SceneFacts, TargetReader, each_readable
 from lang3dxl_ns.preparation.working_photos import WorkingPhotos
 from lang3dxl_ns.scene.capture import Capture
 from lang3dxl_ns.scene.photo import Photo
@@ -134,7 +134,7 @@ class TrainingData:
         use."""
         folder, config = self.capture.folder, self.config
         links = self.capture.settings.follow_links
-        masked = with_foreground(self.as_read, config, folder, self.cache_dir, self.device, say, links)
+        masked = with_foreground(self.as_read, config, folder, self.cache_dir, self.device, links)
         return {photo.name: photo for photo in masked}
 
     @cached_property
@@ -286,14 +286,11 @@ class TrainingData:
         """Yield camera and batch, with targets, of photos by name, one in memory at a time. Damaged ones are
         left out, with a message. Raises UserError if none can be read."""
         targets, number, usable = self.targets, {name: i for i, name in enumerate(self.views)}, False
-        for name in names:
-            try:
-                data = read_data(self.photos[name], self.working, self.scale, targets)
-            except PhotosGoneError:
-                raise
-            except UserError as reason:
-                say(f"{name} is left out: {reason}")
-                continue
+
+        def read_one(name: str) -> dict[str, Any]:
+            return read_data(self.photos[name], self.working, self.scale, targets)
+
+        for name, data in each_readable(read_one, names):
             usable = True
             yield self.views[name], to_batch(data, name, number[name], self.device)
         if not usable:

@@ -5,7 +5,7 @@ import language from "./language.js";
 const { PRESENT } = language.things;
 const TIE = 0.999; // values that are equal in Python may differ by this factor in 16 bits
 
-export const sigmoid = (x) => 1 / (1 + Math.exp(-x));
+const sigmoid = (x) => 1 / (1 + Math.exp(-x));
 
 export class Answers {
   constructor(rows, vocabulary, words) {
@@ -126,7 +126,7 @@ export class Answers {
 export const dot = (a, b) => a.reduce((sum, x, i) => sum + x * b[i], 0);
 
 /** Compute the length of a row's feature; gram: products of the decoder's last layer, or null. */
-export function norm(row, gram) {
+function norm(row, gram) {
   if (!gram) return Math.sqrt(dot(row, row));
   const width = row.length;
   return Math.sqrt(row.reduce((sum, x, i) => sum + x * dot(row, gram.slice(i * width, (i + 1) * width)), 0));

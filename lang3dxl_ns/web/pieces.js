@@ -109,22 +109,21 @@ function ellipseOf(view, { axes, opacities, antialiased }, i, [x, y, z]) {
   return reach > 0 ? { i, x, y, z, opacity, reach, tall: vv, high: Math.sqrt(reach * vv), slope: uv / vv, narrow: vv / area } : null;
 }
 
-/** Go through the rows of pixels that an ellipse fills: the first pixel, the one after the last, how far the first lies
- * to the right of the row's middle, and that one's squared distance in standard deviations. */
+/** Go through the rows of pixels that an ellipse fills: the first pixel, and the one after the last. */
 function eachRow(flat, k, reach, { width, height }, paint) {
   const x = flat[k + X], y = flat[k + Y], tall = flat[k + TALL], slope = flat[k + SLOPE], narrow = flat[k + NARROW];
   const high = Math.sqrt(reach * tall), bottom = Math.min(Math.floor(y + high - 0.5), height - 1);
   for (let row = Math.max(Math.ceil(y - high - 0.5), 0); row <= bottom; row++) {
     const down = row + 0.5 - y, far = (down * down) / tall, wide = Math.sqrt(Math.max(reach - far, 0) / narrow), middle = x + slope * down - 0.5;
     const first = Math.max(Math.ceil(middle - wide), 0), last = Math.min(Math.floor(middle + wide), width - 1);
-    if (first <= last) paint(row * width + first, row * width + last + 1, first - middle, far);
+    if (first <= last) paint(row * width + first, row * width + last + 1);
   }
 }
 
 // ── pieces ──
 
 /** Find the pieces of a map that is drawn, with the Gaussians that each one shows. */
-export function piecesOf({ map, depth, surface, width, height, rows, points, focal }, view) {
+function piecesOf({ map, depth, surface, width, height, rows, points, focal }, view) {
   const { labels, pieces } = split(map, width, height), own = pieces.map(() => []);
   for (let k = 0; k < rows.length; k++) {
     const x = points[3 * k], y = points[3 * k + 1], z = points[3 * k + 2];

@@ -331,20 +331,18 @@ def masks(folder, colors):
 
 
 def masked(photos, folder, **options):
-    lines = []
-    config = PreparationConfig(**options)
-    found = with_foreground(photos, config, folder, folder / "cache", "cpu", lines.append)
-    return {photo.name for photo in found if photo.mask_path is not None}, " ".join(lines)
+    found = with_foreground(photos, PreparationConfig(**options), folder, folder / "cache", "cpu")
+    return {photo.name for photo in found if photo.mask_path is not None}
 
 
-def test_damaged_masks_are_named_all_at_once_and_left_out_where_asked(folder):
+def test_damaged_masks_are_named_all_at_once_and_left_out_where_asked(folder, capsys):
     photos = masks(folder, [None, 255, None, 255])
     with pytest.raises(
         UserError, match=r"2 masks can't be read: .*photo_000\.png .*photo_002\.png .*--skip-damaged-masks"
     ):
         masked(photos, folder)
-    names, said = masked(photos, folder, skip_damaged_masks=True)
-    assert names == {"photo_001.jpg", "photo_003.jpg"}
+    assert masked(photos, folder, skip_damaged_masks=True) == {"photo_001.jpg", "photo_003.jpg"}
+    said = capsys.readouterr().out
     assert "2 masks can't be read" in said and "photo_002.jpg" in said
 
 
@@ -355,13 +353,13 @@ def test_masks_and_label_maps_that_are_pipes_are_refused(tmp_path):
             companion(tmp_path, "a.jpg", [suffix])
 
 
-def test_masks_that_are_all_dark_are_said_to_be(folder):
+def test_masks_that_are_all_dark_are_said_to_be(folder, capsys):
     photos = masks(folder, [0, 100, 0, 0])
     with pytest.raises(UserError, match=r"all 4 masks are dark \(the brightest pixel has 100"):
         masked(photos, folder)
     Image.new("L", (8, 6), 255).save(folder / "masks" / "photo_002.png")
-    _, said = masked(photos, folder)
-    assert "the masks of 3 photos are black or dark" in said
+    masked(photos, folder)
+    assert "the masks of 3 photos are black or dark" in capsys.readouterr().out
 
 
 def test_a_name_too_long_for_a_file_is_one_error(tmp_path):

@@ -67,20 +67,19 @@ def make_mask(path, size=(8, 6), bright=200):
     mask.save(path)
 
 
-def run(photos, config, folder, log=print):
-    return with_foreground(photos, config, folder, folder / "cache", "cpu", log)
+def run(photos, config, folder, **options):
+    return with_foreground(photos, config, folder, folder / "cache", "cpu", **options)
 
 
-def test_a_folder_gives_masks_of_any_size_and_the_log_names_photos_without(photos, tmp_path):
+def test_a_folder_gives_masks_of_any_size_and_the_log_names_photos_without(photos, tmp_path, capsys):
     make_mask(tmp_path / "kept" / "north" / "a.png", size=(8, 6))
     make_mask(tmp_path / "kept" / "c.png.png", size=(400, 300))
-    lines = []
-    masked = run(photos, PreparationConfig(foreground="kept"), tmp_path, lines.append)
+    masked = run(photos, PreparationConfig(foreground="kept"), tmp_path)
     right = (torch.arange(40) >= 20).expand(30, 40)
     assert torch.equal(masked[0].read_mask(), right)
     assert torch.equal(masked[2].read_mask(), right)
     assert masked[1].read_mask() is None  # the whole photo
-    assert lines == ["1 of 3 photos have no mask and are used whole: north/b.png"]
+    assert capsys.readouterr().out == "1 of 3 photos have no mask and are used whole: north/b.png\n"
 
 
 def test_masks_are_links_out_of_their_folder_only_where_links_are_followed(photos, tmp_path):
@@ -90,19 +89,18 @@ def test_masks_are_links_out_of_their_folder_only_where_links_are_followed(photo
     config = PreparationConfig(foreground="kept")
     with pytest.raises(UserError, match="leads out of"):
         run(photos, config, tmp_path)
-    masked = with_foreground(photos, config, tmp_path, tmp_path / "cache", "cpu", print, follow_links=True)
+    masked = run(photos, config, tmp_path, follow_links=True)
     assert [photo.mask_path is None for photo in masked] == [True, True, False]
 
 
-def test_auto_keeps_what_the_data_has_and_none_drops_it(photos, tmp_path):
+def test_auto_keeps_what_the_data_has_and_none_drops_it(photos, tmp_path, capsys):
     make_mask(tmp_path / "masks" / "c.png")
     found = [replace(photo, mask_path=MaskFolder(tmp_path / "masks").find(photo.name)) for photo in photos]
-    lines = []
-    assert run(found, PreparationConfig(), tmp_path, lines.append) == found
-    assert "north/a.png, north/b.png" in lines[0]
-    assert run(found, PreparationConfig(foreground="none"), tmp_path, lines.append) == photos
-    assert run(photos, PreparationConfig(), tmp_path, lines.append) == photos
-    assert len(lines) == 1  # without any mask there is no message
+    assert run(found, PreparationConfig(), tmp_path) == found
+    assert "north/a.png, north/b.png" in capsys.readouterr().out
+    assert run(found, PreparationConfig(foreground="none"), tmp_path) == photos
+    assert run(photos, PreparationConfig(), tmp_path) == photos
+    assert not capsys.readouterr().out  # without any mask there is no message
     assert not (tmp_path / "cache").exists()
 
 
@@ -181,11 +179,12 @@ def test_an_interrupted_run_goes_on_where_it_stopped(photos, config, tmp_path, s
     assert len(seen) == 2
 
 
-def test_a_photo_in_which_nothing_is_found_counts_whole_and_is_named(photos, config, tmp_path, monkeypatch):
+def test_a_photo_in_which_nothing_is_found_counts_whole_and_is_named(
+    photos, config, tmp_path, monkeypatch, capsys
+):
     monkeypatch.setattr(ClipSeg, "segment", lambda self, image, _: torch.zeros(image.shape[:2]) > 0)
-    lines = []
-    assert all(photo.read_mask().all() for photo in run(photos, config, tmp_path, lines.append))
-    assert "found nothing in 3 photos, which are used whole: north/a.png" in lines[-1]
+    assert all(photo.read_mask().all() for photo in run(photos, config, tmp_path))
+    assert "found nothing in 3 photos, which are used whole: north/a.png" in capsys.readouterr().out
 
 
 def test_an_unreadable_photo_has_no_mask_and_affects_no_other(photos, config, tmp_path, seen):
@@ -203,9 +202,9 @@ def test_words_are_needed(photos, config, tmp_path):
 
 
 def test_masks_of_other_prompts_stay(photos, config, tmp_path):
-    first = with_foreground(photos, config, tmp_path, tmp_path / "cache", "cpu", print)
+    first = run(photos, config, tmp_path)
     kept = [photo.mask_path.read_bytes() for photo in first]
     other = replace(config, foreground_prompts=("roof",))
-    second = with_foreground(photos, other, tmp_path, tmp_path / "cache", "cpu", print)
+    second = run(photos, other, tmp_path)
     assert not {photo.mask_path for photo in first} & {photo.mask_path for photo in second}
     assert [photo.mask_path.read_bytes() for photo in first] == kept

@@ -337,13 +337,13 @@ def test_a_model_that_a_full_disk_cuts_off_replaces_nothing(scene, monkeypatch):
 
 def test_a_copy_that_was_interrupted_leaves_nothing(scene, monkeypatch):
     """Else it would be taken for another photo of that name."""
+    copy, photo = scene / "late/copies/a.jpg", scene / "late" / LATE[0]
     monkeypatch.setattr(os, "fsync", lambda _: os.write(-1, b""))
     with pytest.raises(OSError, match="Bad file descriptor"):
-        module._copy(scene / "late", {LATE[0]: "copies/a.jpg"})
+        module._copied(photo, copy)
     assert not list((scene / "late/copies").iterdir())
     monkeypatch.undo()
-    module._copy(scene / "late", {LATE[0]: "copies/a.jpg"})
-    copy, photo = scene / "late/copies/a.jpg", scene / "late" / LATE[0]
+    module._copied(photo, copy)
     assert copy.read_bytes() == photo.read_bytes() and copy.stat().st_mtime_ns == photo.stat().st_mtime_ns
 
 

@@ -79,6 +79,8 @@ def test_photos_that_share_features_are_paired_first(monkeypatch):
         "d": features(*range(35, 42)),
     }
     assert set(alike_pairs(photos)) == {("a", "b"), ("c", "d")}
+    strangers = {name: features(10 * i) for i, name in enumerate("abc")}
+    assert set(alike_pairs(strangers)) == {("a", "b"), ("a", "c")}
     assert possible_matches(photos["a"].descriptors, photos["b"].descriptors) == 11
     assert possible_matches(photos["a"].descriptors, torch.empty(0, 64)) == 0
 
