@@ -60,13 +60,14 @@ class Request:
     relation: str | None = None
     others: tuple[Request, ...] = ()
     """What the relation refers to: *the portal*, *the highest tower*."""
-    without: str | None = None
-    """Prompt of things that are left out."""
+    without: Request | None = None
+    """Things that are left out: *not doors*, *not on the tower*."""
 
     @property
     def parts(self) -> list[Request]:
-        """The request and those that its relation refers to, all the way down."""
-        return [self, *(part for other in self.others for part in other.parts)]
+        """The request, what it leaves out, and what its relation refers to, all the way down."""
+        inner = [self.without, *self.others] if self.without else self.others
+        return [self, *(part for other in inner for part in other.parts)]
 
     @property
     def order(self) -> tuple[str, int]:
@@ -76,7 +77,7 @@ class Request:
     @property
     def words(self) -> list[str]:
         """All prompts, each once."""
-        return list(dict.fromkeys(w for part in self.parts for w in (part.word, part.without) if w))
+        return list(dict.fromkeys(part.word for part in self.parts))
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,7 +146,7 @@ def parse(text: str, names: Iterable[str] = ()) -> Request:
     rest = re.sub(rf"^(?:{_any(TABLE['count'])})\s+", "", asked)
     relation, tail = _any(words["relations"]), _any(words["tail"])
     idle = rf"^(?:which|what) (?=.+ (?:are|is|{tail}) (?:{relation}) )|,? (?:{tail})$"
-    idle += rf"| (?:(?:that |which )?(?:are|is)|{tail})(?= (?:{relation}) )"
+    idle += rf"| (?:(?:that |which )?(?:are|is)|{tail})(?= (?:not )?(?:{relation}) )"
     try:
         return replace(_request(re.sub(idle, "", rest), restored), count=rest != asked)
     except UserError as error:
@@ -163,9 +164,9 @@ def meant(name: str, names: Iterable[str] = ()) -> str | None:
 
 def _request(rest: str, restored: Callable[[str], str]) -> Request:
     words = table()
-    without, relation, others = None, None, tuple[Request, ...]()
-    if found := re.fullmatch(r"(.+?) (?:but )?not (.+)", rest):
-        rest, without = found[1], _plain(found[2])
+    left_out, relation, others = None, None, tuple[Request, ...]()
+    if found := re.fullmatch(r"(.+?),? (?:but )?not ((?!.* not ).+)", rest):
+        rest, left_out = found[1], found[2]
     found = re.fullmatch(rf"(.+?) ({_any(words['relations'])}) (.+)", rest)
     if found and _plain(found[3]) not in words["from"]:  # *on the left* names no thing
         rest, relation = found[1], words["relations"][found[2]]
@@ -182,13 +183,14 @@ def _request(rest: str, restored: Callable[[str], str]) -> Request:
     place, (first, _, noun) = first, rest.partition(" ")
     if noun and first in words["superlatives"] and not re.match(r"of\b", noun):
         superlative, rest = first, noun
-    for name in (rest, *([] if without is None else [without])):
-        _check_name(restored(name) and name)  # quotes may hold nothing
+    _check_name(restored(rest) and rest)  # quotes may hold nothing
     if nth and not (along or superlative):
         raise UserError(f"{place} {rest}: say from which side, such as the {place} {rest} from the left")
     if along and (superlative or not nth):
         raise UserError(f"{whole}: say which one, such as the second from the {along}")
-    without = without and restored(without)
+    if left_out and re.match(rf"(?:{_any(words['relations'])}) ", left_out):
+        left_out = f"{rest} {left_out}"  # *windows not on the tower*: without windows on the tower
+    without = _request(left_out, restored) if left_out else None
     return Request(restored(rest), False, superlative, nth, along, relation, others, without)
 
 
@@ -213,7 +215,7 @@ def answer(request: Request, found: Sequence[Things], view: Sight) -> list[Thing
     things = {one.word: one.things for one in found}
     chosen = list(things[request.word])
     if request.without:
-        gone = {thing.id for thing in things[request.without]}
+        gone = {thing.id for thing in answer(request.without, found, view)}
         chosen = [thing for thing in chosen if thing.id not in gone]
     if request.relation:
         others = [answer(other, found, view) for other in request.others]

@@ -8,7 +8,7 @@ const has = (table, word) => Object.hasOwn(table, word), listed = (phrases) => (
 const any = (...kinds) => kinds.flatMap(listed).sort((a, b) => b.length - a.length).join("|");
 const plain = (text) => text.trim().replace(new RegExp(`^(?:(?:${any(language.articles)})(?:\\s+|$))+`), "");
 
-/** Parse a question: { word, count, superlative, nth, along, relation, others: what it refers to, without }. Quotes hold
+/** Parse a question: { word, count, superlative, nth, along, relation, others: what it refers to, without: what it leaves out }. Quotes hold
  * a phrase, and so do names, which were taught. Throws an error, which names the part, for what the grammar doesn't know. */
 export function parse(text, names = []) {
   const { rest, count, restored } = opened(text, names);
@@ -31,14 +31,14 @@ function opened(text, names) {
   cut(new RegExp(`^(?:${any(language.lead)})\\s+`));
   rest = plain(rest);
   const count = cut(new RegExp(`^(?:${any(language.count)})\\s+`));
-  cut(new RegExp(`^(?:which|what) (?=.+ (?:are|is|${tail}) (?:${relation}) )|,? (?:${tail})$| (?:(?:that |which )?(?:are|is)|${tail})(?= (?:${relation}) )`, "g"));
+  cut(new RegExp(`^(?:which|what) (?=.+ (?:are|is|${tail}) (?:${relation}) )|,? (?:${tail})$| (?:(?:that |which )?(?:are|is)|${tail})(?= (?:not )?(?:${relation}) )`, "g"));
   return { rest, count, restored };
 }
 
 function request(rest, restored) {
   const asked = { word: "", count: false, superlative: null, nth: null, along: null, relation: null, others: [], without: null };
-  let found = /^(.+?) (?:but )?not (.+)$/.exec(rest);
-  if (found) [rest, asked.without] = [found[1], plain(found[2])];
+  let leftOut = null, found = /^(.+?),? (?:but )?not ((?!.* not ).+)$/.exec(rest);
+  if (found) [rest, leftOut] = [found[1], found[2]];
   found = new RegExp(`^(.+?) (${any(grammar.relations)}) (.+)$`).exec(rest);
   if (found && !has(grammar.from, plain(found[3]))) {
     [rest, asked.relation, asked.others] = [found[1], grammar.relations[found[2]], found[3].split(/\s+and\s+/).map((part) => request(part, restored))];
@@ -52,10 +52,11 @@ function request(rest, restored) {
   if (ordered) [asked.nth, rest] = [grammar.ordinals[place] ?? parseInt(place), ordered];
   const [, superlative, noun] = new RegExp(`^(${any(grammar.superlatives)}) (?!of(?![\\p{L}\\p{N}_]))(.+)$`, "u").exec(rest) ?? [];
   if (noun) [asked.superlative, rest] = [superlative, noun];
-  for (const name of [rest, ...(asked.without === null ? [] : [asked.without])]) checkName(restored(name) && name); // quotes may hold nothing
+  checkName(restored(rest) && rest); // quotes may hold nothing
   if (asked.nth && !asked.along && !noun) throw new Error(`${place} ${rest}: say from which side, such as the ${place} ${rest} from the left`);
   if (asked.along && (noun || !asked.nth)) throw new Error(`${whole}: say which one, such as the second from the ${asked.along}`);
-  return { ...asked, word: restored(rest), without: asked.without && restored(asked.without) };
+  if (leftOut && new RegExp(`^(?:${any(grammar.relations)}) `).test(leftOut)) leftOut = `${rest} ${leftOut}`; // windows not on the tower: without windows on the tower
+  return { ...asked, word: restored(rest), without: leftOut && request(leftOut, restored) };
 }
 
 const KINDS = ["asks", "unknown", "ordinals", "superlatives", "from", "relations"].map((kind) => grammar[kind]);
@@ -77,8 +78,8 @@ const ASKS = new RegExp(`^(?:${any(grammar.ordinals)}|\\d+(?:st|nd|rd|th)) |${wh
  * phrases that hold such words and are none. */
 export function isQuestion(text, names = [], known = []) {
   try {
-    const { count, superlative, nth, relation } = parse(text, names);
-    return Boolean(count || superlative || nth || relation);
+    const { without, ...asked } = parse(text, names);
+    return [asked, without].some((part) => part?.count || part?.superlative || part?.nth || part?.relation);
   } catch {
     const { rest, count } = opened(text, names);
     return !known.includes(text.trim().toLowerCase()) && (count || ASKS.test(plain(rest)));
@@ -86,8 +87,8 @@ export function isQuestion(text, names = [], known = []) {
 }
 
 const orderOf = ({ superlative, along }) => grammar.superlatives[superlative] ?? grammar.from[along] ?? ["", 0];
-const partsOf = (request) => [request, ...request.others.flatMap(partsOf)];
-export const wordsOf = (request) => [...new Set(partsOf(request).flatMap(({ word, without }) => (without ? [word, without] : [word])))];
+const partsOf = (request) => [request, ...[request.without, ...request.others].flatMap((part) => (part ? partsOf(part) : []))];
+export const wordsOf = (request) => [...new Set(partsOf(request).map(({ word }) => word))];
 
 /** Choose the things that a request asks for. things: those of each word; view: { right, up, ahead, shown: ids of the
  * things that one sees, which alone are numbered from left to right; none: all }. Throws an error if a thing that the relation
@@ -95,7 +96,10 @@ export const wordsOf = (request) => [...new Set(partsOf(request).flatMap(({ word
 export function answerTo(request, things, view) {
   const { word, relation, others, nth, without } = request;
   let chosen = things[word], where = "";
-  if (without) chosen = chosen.filter(({ id }) => !things[without].some((other) => other.id === id));
+  if (without) {
+    const gone = answerTo(without, things, view);
+    chosen = chosen.filter(({ id }) => !gone.some((other) => other.id === id));
+  }
   if (relation) {
     const there = others.map((other) => answerTo(other, things, view)), missing = there.findIndex((some) => !some.length);
     if (missing >= 0) throw new Error(`no ${others[missing].word} found, to which a relation has an answer: leave it out, or teach the word`);

@@ -26,6 +26,8 @@ from lang3dxl_ns.things.grammar import (
 from lang3dxl_ns.things.thing import Sighting
 from lang3dxl_ns.words.taught_words import Example
 
+ON_TOWER = Request("windows", relation="in", others=(Request("tower"),))
+
 
 @pytest.mark.parametrize(
     ("text", "request_"),
@@ -39,7 +41,7 @@ from lang3dxl_ns.words.taught_words import Example
             "the window between the portals",
             Request("window", relation="between", others=(Request("portals"),)),
         ),
-        ("count windows not doors", Request("windows", count=True, without="doors")),
+        ("count windows not doors", Request("windows", count=True, without=Request("doors"))),
         ("rose window", Request("rose window")),
         (
             "largest window above the portal",
@@ -78,7 +80,11 @@ from lang3dxl_ns.words.taught_words import Example
         ("windows beneath the left-hand tower",
          Request("windows", relation="below", others=(Request("tower", superlative="left"),))),
         ('how many "Statue on the roof"', Request("Statue on the roof", count=True)),
-        ("how many “doors and gates” not 'a' door", Request("doors and gates", True, without="'a' door")),
+        ("how many “doors and gates” not 'a' door",
+         Request("doors and gates", True, without=Request("'a' door"))),
+        ("windows that are not on the tower", Request("windows", without=ON_TOWER)),
+        ("highest windows above the portal but not on the tower",
+         Request("windows", False, "highest", None, None, "above", (Request("portal"),), ON_TOWER)),
         ('"top" windows above the "left gate"',
          Request("top windows", relation="above", others=(Request("left gate"),))),
     ],
@@ -92,7 +98,7 @@ def test_taught_names_and_quotes_hold_a_phrase(typed):
     names, word = ["Statue on the roof", "1"], typed.strip('"')
     assert parse(f"how many {typed}", names) == Request(word, count=True)
     assert parse(f"windows above the second {typed} from the left", names).others[0].word == word
-    assert parse(f'"big window" on 1 not {typed}', names).without == word
+    assert parse(f'"big window" on 1 not {typed}', names).without == Request(word)
     assert parse("statue on the roofs", names).relation == "in"
 
 
@@ -117,6 +123,8 @@ def test_taught_names_and_quotes_hold_a_phrase(typed):
             'how many ""',
             'windows above ""',
             'windows not " "',
+            "windows not doors not arches",
+            "windows not the",
         ),
     ],
 )
@@ -167,6 +175,9 @@ def test_questions_choose_by_place_and_size_and_mirror_with_the_viewer():
     assert ids("portal below the leftmost window") == ids("portal left of the rightmost window") == [9]
     assert ids("portal left of the leftmost window") == []
     assert ids("window left of the right window") == [0, 1, 3]
+    assert ids("window not left of the portal") == [2, 3]  # the rest of those that are
+    assert ids("leftmost window not left of the portal") == [3]
+    assert ids("window above the portal, but not left of the right window") == [2]
     assert ids("second highest window") == ids("second largest window") == [1]  # in their order
     with pytest.raises(UserError, match="only 4"):
         ids("fifth window from the left")

@@ -56,6 +56,8 @@ QUESTIONS = [
     *("how many statue on the roof", "big Statue On The Roof not 1", "one-way signs", "0th door"),
     *("the second-highest window", "left-most tower", "2nd-largest dome", "what is the number of windows"),
     *("the number of windows", "how many of the windows are above the dome", "twelfth window from the left"),
+    *("windows not on the tower", "highest window left of the door but not above it", "windows, not a not b"),
+    *("how many windows are not above the highest door", "windows, but not doors above the portal"),
     *("windows directly above the dome", 'how many ""', 'windows above ""', 'windows not " "', "tower-left"),
 ]
 """Questions that the grammar reads, and some that it refuses."""
