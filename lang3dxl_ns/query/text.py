@@ -31,6 +31,8 @@ NOT_FINISHED = (
     "command again)"
 )
 
+_MOST_LETTERS = 200
+"""Most letters of a word that is taught."""
 _SAME = 0.95
 """Cosine from which a vector and a phrase are taken to mean the same."""
 _QUOTED = r'"[^"]*"'
@@ -71,6 +73,8 @@ def taught_prompt(word: str) -> Prompt:
     """Return the prompt of a word that is to be taught. Raises UserError if no prompt means this word."""
     if not re.search(r"\w", word):
         raise UserError("the prompt is empty: type what to look for, such as rose window")
+    if len(word) > _MOST_LETTERS:
+        raise UserError(f"a word of {len(word):,} letters: choose one of {_MOST_LETTERS} at most")
     prompt, *more = parse_prompts(word if '"' in word else f'"{word}"')
     if more or known_word(prompt.text) != known_word(word):
         raise UserError(f"no prompt means {word!r}: name the word without quotes and semicolons")
