@@ -114,12 +114,15 @@ _PLACES = (".scene", ".glb", ".spz", ".yml", ".ply", ".sog", ".splat", ".pt", ".
 """Endings of what holds a scene or a splat."""
 _REPEATED = ("--text", "--ask", "--not", "--segment", "--forget")
 """Options that take one text each time."""
+_MANY = (*_REPEATED, "--at", "--not-at")
+"""Options that may be given several times."""
 
 
 def _parsed(words: Sequence[str]) -> Any:
     """Parse the words into the called command with its settings. Exits with a hint if they are not valid."""
     _check_no_empty(words)
     _check_name(COMMANDS, words)
+    _check_once(words)
     words = with_data_as_taken(with_all_texts(words))
     try:
         config = (tyro.conf.OmitArgPrefixes,)
@@ -170,6 +173,14 @@ def _check_no_empty(words: Sequence[str]) -> None:
         if not word or (word.startswith("--") and word.endswith("=")):
             where = word.rstrip("=") or before
             raise UserError(f"what follows {where} is empty, as a variable that is not set: give a value")
+
+
+def _check_once(words: Sequence[str]) -> None:
+    """Check that no option has two values, of which the first would count for nothing. Raises UserError."""
+    options = [word.partition("=")[0].replace("_", "-") for word in words if word.startswith("--")]
+    twice = [option for option in options if options.count(option) > 1 and option not in _MANY]
+    if twice:
+        raise UserError(f"{twice[0]} is given {options.count(twice[0])} times: give it once")
 
 
 def _check_name(commands: Mapping[str, Any], words: Sequence[str], above: str = "lang3dxl") -> None:

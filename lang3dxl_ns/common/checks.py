@@ -23,11 +23,12 @@ def check_numbers(settings: object, bounds: Mapping[str, tuple[float, float]], p
 
 def disk_trouble(error: OSError) -> str | None:
     """Return a message about a file that cannot be read or written; None for other errors."""
-    if error.errno not in _REMEDIES:
+    if error.errno is None:
         return None
     if error.filename is None:  # a stream has no name
         return f"the output can't be written: {error.strerror}" if error.errno == errno.ENOSPC else None
-    return f"{error.filename}: {error.strerror}; {_REMEDIES[error.errno]}"
+    # Systems have many more reasons than those below.
+    return f"{error.filename}: {error.strerror}; {_REMEDIES.get(error.errno, _NO_USE)}"
 
 
 def is_coordinate(value: object) -> bool:
@@ -59,6 +60,7 @@ def check_address(host: str, port: int | None) -> None:
         ) from error
 
 
+_NO_USE = "choose another place or name"
 _NO_SPACE = "free some space and run the same command again"
 _NO_RIGHT = "choose another place, or change its permissions"
 _NO_FOLDER = "name a folder, not a file or a path below one"
@@ -74,6 +76,8 @@ _REMEDIES = {
     errno.ENAMETOOLONG: "choose a shorter name",
     errno.ENOENT: "it does not exist; correct the name",
     errno.ELOOP: "its links lead in a circle; remove them",
+    errno.EFBIG: "its disk holds no file so large (FAT32: 4 GB), or `ulimit -f` allows none: choose another",
+    errno.EMFILE: "allow more open files (ulimit -n 4096)",
     errno.EIO: "the disk or network share does not answer; restore it",
     errno.ESTALE: "the share does not answer; mount it again",
 }

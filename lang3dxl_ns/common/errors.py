@@ -11,9 +11,14 @@ from zipfile import BadZipFile
 
 from lang3dxl_ns.common.memory import ran_out_of_memory
 
+try:
+    from lzma import LZMAError
+except ImportError:  # a Python that was built without it unpacks no such archive
+    LZMAError = BadZipFile  # type: ignore[misc, assignment]
+
 DAMAGE = (
     *(OSError, EOFError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RuntimeError),
-    *(AssertionError, struct.error, zlib.error, BadZipFile),
+    *(AssertionError, struct.error, zlib.error, BadZipFile, LZMAError),
 )
 """Exceptions raised when values are read that a damaged file does not have. A RuntimeError may also mean a
 full memory, which `not_of_memory` tells apart."""

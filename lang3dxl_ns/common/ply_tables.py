@@ -90,6 +90,11 @@ def read_vertices(file: BinaryIO, form: str, tables: dict[str, Table]) -> dict[s
     return _binary_columns(file, before, tables["vertex"])
 
 
+def plainly(columns: dict[str, Any]) -> dict[str, Any]:
+    """Name columns in small letters and without CloudCompare's prefix; those already named so win."""
+    return {name.lower().removeprefix("scalar_"): column for name, column in columns.items()} | columns
+
+
 def _binary_columns(file: BinaryIO, before: list[Table], vertices: Table) -> dict[str, Any]:
     file.seek(sum(table.length * table.row().itemsize for table in before), 1)
     start, lengths = file.tell(), dict[str, int]()

@@ -50,7 +50,7 @@ def read_checkpoint(path: Path) -> Splats:
         return _splatfacto(parts["pipeline"], path)
     if isinstance(parts.get("splats"), dict):
         return _gsplat(parts["splats"], path)
-    raise UserError("it is a checkpoint of a program other than gsplat and nerfstudio")
+    raise UserError("it is a checkpoint of a program other than gsplat and nerfstudio: give a .ply of it")
 
 
 def _gsplat(parts: Mapping[str, Any], path: Path) -> Splats:
@@ -97,5 +97,5 @@ def _check_parts(parts: Mapping[str, Any], names: tuple[str, ...]) -> None:
         expect(name not in names or len(value) == count, f"{name} are not as many as means")
         if isinstance(value, Tensor):
             stored = value.untyped_storage().nbytes()
-            expect(value.nbytes <= stored, f"{name} is larger than what is stored of it")
+            expect(value.is_cpu and value.nbytes <= stored, f"{name} is larger than what is stored of it")
     check_memory(count, ALL_BANDS)

@@ -17,7 +17,7 @@ from lang3dxl_ns.common.checks import expect
 from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.common.pictures import color_bytes
-from lang3dxl_ns.common.ply_tables import Table, read_header, read_vertices
+from lang3dxl_ns.common.ply_tables import Table, plainly, read_header, read_vertices
 from lang3dxl_ns.files.activations import (
     ALL_BANDS,
     activated,
@@ -47,11 +47,13 @@ def read_ply(path: Path) -> Splats:
         antialiased = any(map(_ANTIALIASED.fullmatch, lines))
         if "chunk" in tables and "packed_position" in names:
             return replace(_supersplat(path, tables), antialiased=antialiased)
-        # CloudCompare names all columns but the coordinates so.
-        known = {name.lower().removeprefix("scalar_"): name for name in names}
-        colors = _COLORS if _COLORS[0] in known else _HARMONICS
+        known = plainly({name: name for name in names})
+        colors = _COLORS if _COLORS[0] in known and _HARMONICS[0] not in known else _HARMONICS
         if missing := [name for name in (*_NEEDED, *colors) if name not in known]:
-            raise UserError(f"not a splat but a point cloud: its points have no {', '.join(missing[:3])}")
+            told = ", ".join(missing[:3])
+            if "opacity" in known:
+                raise UserError(f"its Gaussians have no {told}: export them as 3D Gaussian splatting does")
+            raise UserError(f"not a splat but a point cloud: its points have no {told}")
         check_memory(vertices.length, 1 + sum(name.startswith("f_rest_") for name in known) // 3)
         columns = read_vertices(file, form, tables)
         splats = _splats_of({plain: columns[name] for plain, name in known.items() if name in columns})

@@ -21,7 +21,7 @@ from lang3dxl_ns.query.negatives import NEGATIVES, competitors
 from lang3dxl_ns.query.relevancy import Queries
 from lang3dxl_ns.query.vocabulary import searched, synonyms_of
 from lang3dxl_ns.scene.record import SceneRecord, same_clip
-from lang3dxl_ns.words.taught_words import TaughtWord, known_word
+from lang3dxl_ns.words.taught_words import MOST_LETTERS, TaughtWord, known_word
 
 EncodeTexts = Callable[[list[str]], Float[Tensor, "n c"]]
 """Function that encodes texts, such as `ImageTextEncoder.encode_texts`."""
@@ -71,6 +71,8 @@ def taught_prompt(word: str) -> Prompt:
     """Return the prompt of a word that is to be taught. Raises UserError if no prompt means this word."""
     if not re.search(r"\w", word):
         raise UserError("the prompt is empty: type what to look for, such as rose window")
+    if len(word) > MOST_LETTERS:
+        raise UserError(f"a word of {len(word):,} letters: choose one of {MOST_LETTERS} at most")
     prompt, *more = parse_prompts(word if '"' in word else f'"{word}"')
     if more or known_word(prompt.text) != known_word(word):
         raise UserError(f"no prompt means {word!r}: name the word without quotes and semicolons")

@@ -327,6 +327,8 @@ def _usable(
             mask = (masks_of or {}).get(name)
             if mask is None and masks is not None:
                 mask = masks.find(file)
+            if mask is not None and mask.samefile(path):
+                mask = None  # the folder of the photos was named as that of their masks
             photos.append(Photo.from_model(turned, path, mask))
             kept[file] = turned
         except UserError as reason:

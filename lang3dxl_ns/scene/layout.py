@@ -26,13 +26,16 @@ _DEPTH = 3
 """Levels of folders below a scene's that are searched for a model."""
 _RESULTS = ("lang3dxl_cache", "outputs", "nerfstudio_models")
 _OTHER_CAMERAS = {
-    **{"cameras.xml": "Metashape", "*.xmp": "RealityScan", "*.nvm": "VisualSFM", "*.sfm": "Meshroom"},
+    **{"*.xml": "Metashape", "*.xmp": "RealityScan", "*.csv": "RealityScan", "*.nvm": "VisualSFM"},
     **{"bundle*.out": "Bundler", "sfm_data.json": "OpenMVG", "reconstruction.json": "OpenSfM"},
-    **{"poses_bounds.npy": "LLFF", "opensfm/reconstruction.json": "OpenDroneMap"},
+    **{"*.sfm": "Meshroom", "poses_bounds.npy": "LLFF", "opensfm/reconstruction.json": "OpenDroneMap"},
     **{"keyframes/corrected_cameras": "Polycam", "metadata.json": "Record3D"},
 }
 """Files and folders with cameras that can't be read here, and the programs that write them."""
-_MARKS = {"*.xmp": "capturingreality", "metadata.json": '"poses"'}
+_MARKS = {
+    **{"*.xml": "<document", "*.xmp": "capturingreality", "*.csv": "#name,x,"},
+    **{"metadata.json": '"poses"'},
+}
 """Texts in such files whose names others have too: those of photo editors, and of Google's archives."""
 
 

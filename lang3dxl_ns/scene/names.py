@@ -6,6 +6,7 @@ import unicodedata
 from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterable, Sequence
 from pathlib import Path
+from urllib.parse import unquote
 
 from lang3dxl_ns.common.checks import expect
 from lang3dxl_ns.common.console import say, some
@@ -43,6 +44,8 @@ def name_finder(files: Iterable[str]) -> Callable[[str], list[str]]:
             return []
         *folders, last = parts
         fitting = by_name.get(last) or by_stem.get(last) or by_stem.get(Path(last).stem, [])
+        if not fitting and (written := unquote(name)) != name:  # as in addresses: my%20photo.jpg
+            return find(written)
         return _deepest(tuple(folders), fitting)
 
     return find

@@ -41,6 +41,7 @@ _BEGINNINGS = re.compile(rb"\xff\xd8\xff|\x89PNG\r\n|GIF8|RIFF....WEBP|....ftyp(
 """First bytes of pictures that are read."""
 _OWN = re.compile(r"\.[0-9a-f]{16}\.(png|jpg)$")
 """Ends of the names of pictures in a feature store, which --cache-dir may put into the photos' folder."""
+_PAGE_PHOTO = re.compile(r"photo\d+\.jpg")
 _PHONE_PANORAMA = 6
 """Value that phones give to EXIF's CustomRendered."""
 _WIDEST = 3.0
@@ -203,9 +204,10 @@ def photos_below(folder: Path) -> list[str]:
         if Path(parent).name in ("reconstruction", "adding"):
             folders[:] = [f for f in folders if f != "numbered"]
             files = [f for f in files if f != PICTURE.name or REPORT.name not in files]
+        ours = _results(Path(parent), files)
         pictures = [
             file
-            for file in files
+            for file in set(files) - ours
             if Path(file).suffix.lower() in _KNOWN and not file.startswith(".") and not _OWN.search(file)
         ]
         lower = {name for file in pictures for name in (file.casefold(), Path(file).stem.casefold())}
@@ -213,6 +215,16 @@ def photos_below(folder: Path) -> list[str]:
             if lower.isdisjoint(photos_of_mask(file.casefold())):
                 names.append(Path(parent, file).relative_to(folder).as_posix())
     return sorted(names)
+
+
+def _results(folder: Path, files: Collection[str]) -> set[str]:
+    """Return those of a folder's files that are pictures of `lang3dxl query`, `things` or `export --web`."""
+    if folder.name.startswith("together") and (folder.parent / "query.json").is_file():
+        return set(files)
+    stems = [file.removesuffix(".overlay.png") for file in files if file.endswith(".overlay.png")]
+    found = {f"{stem}.{kind}.png" for stem in stems for kind in ("overlay", "mask")}
+    found |= {"things.png"} if "things.json" in files else set()
+    return found | ({file for file in files if _PAGE_PHOTO.fullmatch(file)} if "page.js" in files else set())
 
 
 def smaller_copies(folder: Path) -> list[str]:

@@ -14,7 +14,7 @@ from lang3dxl_ns.common.console import say
 from lang3dxl_ns.common.errors import UserError, readable
 from lang3dxl_ns.common.files import open_file
 from lang3dxl_ns.common.pictures import color_bytes
-from lang3dxl_ns.common.ply_tables import read_header, read_vertices
+from lang3dxl_ns.common.ply_tables import plainly, read_header, read_vertices
 
 _COLORS = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
 _HARMONICS, _C0 = ("f_dc_0", "f_dc_1", "f_dc_2"), 0.28209479177387814
@@ -32,7 +32,7 @@ def read_ply_points(path: Path) -> tuple[Float64[Array, "m 3"], UInt8[Array, "m 
                 columns = read_vertices(file, form, tables)
             except UserError as error:
                 raise UserError(f"{path}: {error}") from error
-        named = {name.lower().removeprefix("scalar_"): values for name, values in columns.items()}
+        named = plainly(columns)
         expect(all(axis in named for axis in "xyz"), "it has no columns x, y, z")
         points = np.column_stack([named[axis].astype(np.float64) for axis in "xyz"])
     sound = (np.abs(points) < FARTHEST).all(axis=1)

@@ -30,6 +30,8 @@ _OUTLINE, _BOX = 100, 30
 """Number of clicks that an outline and a box are worth."""
 _MOST_WEIGHT = 100.0
 """Largest weight of a word's text; those that are learned are at most 1.5."""
+MOST_LETTERS = 200
+"""Most letters of a word's name."""
 _MOST_PIXELS = 1 << 30
 """Most pixels of all masks in one file of words: a thousand of the largest."""
 _VERSION = 1
@@ -250,4 +252,6 @@ def load_words(path: Path) -> list[TaughtWord]:
         content = read_json(expanded(path))
         if content["version"] != _VERSION:
             raise UserError(f"{path} has format {content['version']!s:.20}: update lang3dxl-ns to read it")
-        return words_from_json(content["words"])
+        words = words_from_json(content["words"])
+        expect(all(len(word.name) <= MOST_LETTERS for word in words), "a word has too many letters")
+        return words

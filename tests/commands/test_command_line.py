@@ -110,6 +110,19 @@ def test_several_texts_may_follow_their_flag_and_the_scene_too(flag, tmp_path):
     assert cli.with_all_texts(["teach", scene, "--text=a", "b"]) == ["teach", scene, "--text=a", "b"]
 
 
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["teach", "a.scene", "--word", "door", "--photo", "a", "--at", "1,1", "--photo", "b", "--at", "2,2"],
+        ["export", "a.scene", "--out=a.ply", "--out", "b.spz"],
+        ["train", "photos", "--photo_scale", "1", "--photo-scale", "0.5"],
+    ],
+)
+def test_a_value_that_would_count_for_nothing_is_told(words):
+    with pytest.raises(SystemExit, match=r"--(photo|out|photo-scale) is given 2 times: give it once"):
+        cli.main(words)
+
+
 @pytest.mark.parametrize("word", ["castl.scene", "castl.GLB", "../runs/castle"])
 def test_a_mistyped_scene_is_no_text_of_the_newest_run(word):
     for text in ("St. Mary", "doors and/or gates"):

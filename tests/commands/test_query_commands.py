@@ -13,6 +13,7 @@ from lang3dxl_ns.commands import export, query
 from lang3dxl_ns.commands.query import file_names
 from lang3dxl_ns.common.files import slugs
 from lang3dxl_ns.files.scene_file import Provenance
+from lang3dxl_ns.scene.photo_folder import photos_below
 
 
 @pytest.fixture
@@ -71,6 +72,21 @@ def test_query_writes_pictures_map_and_report(run, tmp_path, capsys):
         np.ptp(picture[mask == 255], axis=1) > 0
     ).all()
     assert "dome" in capsys.readouterr().out
+
+
+def test_answers_are_no_photos(run, tmp_path):
+    """They lie among photos if someone asks in the folder of the photos, as training proposes."""
+    (tmp_path / "windows").mkdir()
+    for name in ("a.png", "windows/b.mask.png", "windows/photo1.jpg"):
+        Image.new("RGB", (90, 90)).save(tmp_path / name)
+    before = photos_below(tmp_path)
+    run("query", "c", "--text", "dome", "windows", "--out", tmp_path / "found", "--all")
+    for mark, picture in (("page/page.js", "page/photo0.jpg"), ("list/things.json", "list/things.png")):
+        (tmp_path / mark).parent.mkdir()
+        (tmp_path / mark).touch()
+        Image.new("RGB", (90, 90)).save(tmp_path / picture)
+    assert list((tmp_path / "found").glob("together/*.png")) and len(before) == 3
+    assert photos_below(tmp_path) == before
 
 
 def test_a_text_that_is_given_twice_is_asked_once(run, tmp_path):

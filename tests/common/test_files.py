@@ -83,6 +83,23 @@ def test_links_in_a_circle_are_told_with_what_helps_and_stay(tmp_path, change):
     assert (tmp_path / "a").is_symlink() and (tmp_path / "b").is_symlink()
 
 
+@pytest.mark.parametrize(
+    ("number", "told"),
+    [
+        (errno.EFBIG, "FAT32: 4 GB"),
+        (errno.EMFILE, "ulimit -n"),
+        (errno.EINVAL, "choose another place or name"),
+        (errno.EHOSTDOWN, "choose another place or name"),
+    ],
+)
+def test_whatever_a_system_says_of_a_file_is_told_with_its_name(number, told):
+    """Disks and shares have many reasons: exFAT takes no colon in a name, FAT32 no file of 4 GB."""
+    message = disk_trouble(OSError(number, os.strerror(number), "a:b.ply"))
+    assert message.startswith("a:b.ply: ") and told in message
+    assert disk_trouble(OSError(number, os.strerror(number))) is None  # of no file
+    assert disk_trouble(OSError("of a library")) is None
+
+
 @pytest.mark.parametrize("letter", ["a", "é", "🏰"])
 def test_a_file_whose_name_fills_what_the_disk_allows_is_written(tmp_path, letter):
     """As names of downloads that hold a whole sentence."""

@@ -415,6 +415,18 @@ def test_pictures_of_a_sog_are_webp_or_png_whatever_their_names(form, known, tmp
             read_splats(tmp_path / "b.sog")
 
 
+@pytest.mark.parametrize("how", [zipfile.ZIP_LZMA, zipfile.ZIP_BZIP2, zipfile.ZIP_DEFLATED])
+def test_a_damaged_sog_that_is_packed_in_any_way_is_refused(how, tmp_path):
+    with zipfile.ZipFile(tmp_path / "a.sog", "w", how) as bundle:
+        bundle.writestr("meta.json", json.dumps({"version": 2, "count": 3}))
+    content = bytearray((tmp_path / "a.sog").read_bytes())
+    start = bundle.getinfo("meta.json").header_offset + 30 + len("meta.json")
+    content[start + 9 : start + 19] = b"\xff" * 10
+    (tmp_path / "a.sog").write_bytes(content)
+    with pytest.raises(UserError, match="damaged or incomplete"):
+        read_splats(tmp_path / "a.sog")
+
+
 @pytest.mark.parametrize(
     ("name", "content"),
     [("a.glb", b"glTF"), ("a.glb", b"glTF" + bytes(60)), ("a.sog", b"PK"), ("a.sog", b"")],

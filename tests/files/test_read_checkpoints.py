@@ -12,6 +12,7 @@ from lang3dxl_ns.common.errors import UserError
 from lang3dxl_ns.files.activations import log_scales, logits
 from lang3dxl_ns.files.read_splats import read_splats
 from lang3dxl_ns.rendering import Splats
+from lang3dxl_ns.training.checkpoint import load_checked
 
 
 def splatfacto_state(splats: Splats) -> dict:
@@ -101,3 +102,21 @@ def test_older_names_in_checkpoints_are_read(tmp_path):
     parts["_model.colors_all"] = torch.cat([first[:, None], rest], dim=1)
     torch.save({"pipeline": parts}, tmp_path / "b.ckpt")
     assert_alike(read_splats(tmp_path / "b.ckpt"), splats)
+
+
+@pytest.mark.parametrize("part", ["means", "scales", "sh0"])
+def test_a_checkpoint_that_names_numbers_it_does_not_hold_is_refused(part, tmp_path):
+    state = gsplat_state(some_splats(9))
+    state["splats"][part] = state["splats"][part].to("meta")
+    torch.save(state, tmp_path / "a.pt")
+    with pytest.raises(UserError, match=rf"{part} is larger than what is stored of it"):
+        read_splats(tmp_path / "a.pt")
+    torch.save({"tensors": state["splats"], "step": 1}, tmp_path / "b.pt")
+    with pytest.raises(ValueError, match=rf"{part} is larger than what is stored of it"):
+        load_checked(tmp_path / "b.pt", "tensors")
+
+
+def test_a_checkpoint_of_another_program_is_told_with_the_way_out(tmp_path):
+    torch.save(((3, torch.zeros(2, 3)), 30_000), tmp_path / "chkpnt30000.pth")
+    with pytest.raises(UserError, match=r"other than gsplat and nerfstudio: give a \.ply"):
+        read_splats(tmp_path / "chkpnt30000.pth")

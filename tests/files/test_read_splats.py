@@ -51,7 +51,7 @@ def test_sizes_and_opacities_that_are_no_logarithms_and_logits_are_read_as_they_
     assert_alike(read_splats(tmp_path / "b.ply"), splats, scales=1e-4, colors=1e-5)
     assert "taken as they are" in capsys.readouterr().out
     write_table(tmp_path / "c.ply", rows[[n for n in names if n != "f_dc_1"]].copy(), "ascii", "<f4", "float")
-    with pytest.raises(UserError, match="its points have no f_dc_1"):
+    with pytest.raises(UserError, match="its Gaussians have no f_dc_1"):
         read_splats(tmp_path / "c.ply")
 
 
@@ -596,3 +596,31 @@ def test_a_scene_is_told_from_unknown_formats(tmp_path):
         (tmp_path / name).write_bytes(b"PK")
         with pytest.raises(UserError, match=told):
             read_splats(tmp_path / name)
+
+
+@pytest.mark.parametrize("further", ["X", "scalar_x", "scalar_Opacity", "Red"])
+def test_a_column_is_not_taken_for_one_whose_name_it_resembles(further, tmp_path):
+    splats = some_splats()
+    write_splats(tmp_path / "a.ply", splats)
+    _, rows = table(tmp_path / "a.ply")
+    rows = recfunctions.append_fields(rows, further, np.full(len(rows), 7, "<f4"), usemask=False)
+    write_table(tmp_path / "b.ply", rows, "binary_little_endian", "<f4", "float")
+    assert_alike(read_splats(tmp_path / "b.ply"), splats)
+
+
+@pytest.mark.parametrize(
+    ("without", "told"),
+    [
+        (("f_dc_0", "f_dc_1", "f_dc_2"), "its Gaussians have no f_dc_0, f_dc_1, f_dc_2: export"),
+        (("scale_1", "scale_2"), "its Gaussians have no scale_1: export them as"),
+        (("opacity",), "a point cloud: its points have no opacity"),
+    ],
+)
+def test_a_splat_of_another_kind_is_not_called_a_point_cloud(without, told, tmp_path):
+    """As Scaffold-GS makes, whose colors come from a network, or one of balls."""
+    write_splats(tmp_path / "a.ply", some_splats(9))
+    _, rows = table(tmp_path / "a.ply")
+    rows = recfunctions.drop_fields(rows, list(without), usemask=False)
+    write_table(tmp_path / "b.ply", rows, "binary_little_endian", "<f4", "float")
+    with pytest.raises(UserError, match=told):
+        read_splats(tmp_path / "b.ply")

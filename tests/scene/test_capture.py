@@ -172,10 +172,13 @@ def test_a_binary_model_may_name_removed_photos(folder):
         ("a", "a.png"),
         ("day2/b.jpg", "day2/b.png"),
         ("caf\u0065\u0301.png", "caf\u00e9.png"),
+        ("https://scans.org/caf%C3%A9.png", "caf\u00e9.png"),
+        ("day2%2Fb.jpg", "day2/b.png"),
+        ("50%25.png", "50%25.png"),
     ],
 )
 def test_names_of_other_programs_find_their_file(name, file):
-    files = ["a.png", "day1/b.png", "day2/b.png", "caf\u00e9.png"]
+    files = ["a.png", "day1/b.png", "day2/b.png", "caf\u00e9.png", "50%25.png", "50%.png"]
     assert name_finder(files)(name) == [file]
 
 

@@ -206,9 +206,11 @@ def test_photos_of_blender_are_trained_on_whatever_is_there_of_the_test(scene, s
 def test_cameras_that_are_not_read_are_named(scene, capsys):
     mention_other_cameras(scene)
     assert not capsys.readouterr().out
-    (scene / "cameras.xml").write_text("<document/>")
+    (scene / "castle.xml").write_text("<document/>")
+    (scene / "castle.csv").write_text("#name,x,y,alt,heading,pitch,roll\n")
     mention_other_cameras(scene)
-    assert "cameras.xml holds cameras of Metashape" in capsys.readouterr().out
+    told = capsys.readouterr().out
+    assert "castle.xml holds cameras of Metashape" in told and "castle.csv holds cameras of Real" in told
     (scene / "transform.json").write_text(json.dumps({"frames": [{"transform_matrix": []}]}))
     (scene / "notes.json").write_text("{}")
     mention_other_cameras(scene)
@@ -217,7 +219,13 @@ def test_cameras_that_are_not_read_are_named(scene, capsys):
 
 
 @pytest.mark.parametrize(
-    ("name", "content"), [("a.xmp", '<x xmlns:crs="camera-raw"/>'), ("metadata.json", '{"title": "Rome"}')]
+    ("name", "content"),
+    [
+        ("a.xmp", '<x xmlns:crs="camera-raw"/>'),
+        ("metadata.json", '{"title": "Rome"}'),
+        ("a.xml", "<plist/>"),
+        ("a.csv", "photo,place\n"),
+    ],
 )
 def test_notes_of_photo_editors_and_archives_are_no_cameras(scene, capsys, name, content):
     (scene / name).write_text(content)

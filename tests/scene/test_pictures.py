@@ -2,14 +2,18 @@
 
 import base64
 import io
+import json
 import zlib
+from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import ExifTags, Image, PngImagePlugin, TiffImagePlugin
+from scenes import write_transforms
 
 from lang3dxl_ns.common.pictures import mask_values, open_picture
 from lang3dxl_ns.scene.capture import open_capture
+from lang3dxl_ns.scene.capture_settings import CaptureSettings
 from lang3dxl_ns.scene.matching import numbered
 from lang3dxl_ns.scene.photo_folder import find_photos, readable
 
@@ -55,6 +59,19 @@ def test_masks_that_no_photo_finds_are_told(folder, capsys, name):
     Image.new("L", (96, 72), 255).save(folder / "masks" / name, "PNG")
     open_capture(folder)
     assert "has no picture that is named like a photo" in capsys.readouterr().out
+
+
+def test_a_photo_is_no_mask_of_itself(folder, capsys):
+    """As where --foreground names the folder of the photos."""
+    found = open_capture(folder, CaptureSettings(masks_path=Path("images")))
+    assert all(photo.mask_path is None for photo in found.photos)
+    assert "has no picture that is named like a photo" in capsys.readouterr().out
+    write_transforms(folder)
+    content = json.loads((folder / "transforms.json").read_text())
+    for frame in content["frames"]:
+        frame["mask_path"] = frame["file_path"]
+    (folder / "transforms.json").write_text(json.dumps(content))
+    assert all(photo.mask_path is None for photo in open_capture(folder / "transforms.json").photos)
 
 
 @pytest.mark.parametrize("mode", ["RGBA", "LA", "P"])

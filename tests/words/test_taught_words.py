@@ -239,6 +239,8 @@ def test_one_marked_pixel_is_a_mark(scene):
         *("", "[]", "{}", '{"version": 1}', '{"version": 1, "words": [{}]}', '{"version": 1, "words": 3}'),
         '{"version": 1, "words": [{"name": " ", "bias": 0, "text": 0, "doubt": 0, "vector": [1], '
         '"precision": {}, "examples": [], "scene": "", "clip": null}]}',
+        '{"version": 1, "words": [{"name": "%s", "bias": 0, "text": 0, "doubt": 0, "vector": [1], '
+        '"precision": {}, "examples": [], "scene": "", "clip": null}]}' % ("x" * 9999),
     ],
 )
 def test_damaged_files_are_one_sentence(tmp_path, content):
