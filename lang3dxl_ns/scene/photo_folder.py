@@ -77,6 +77,8 @@ def check_data(data: Path | None) -> None:
 
 
 def _no_place(data: Path) -> UserError:
+    if data.is_file() and data.suffix.lower() in _KNOWN:
+        return UserError(f"{data} is one photo: give the folder that holds it and the others, {data.parent}")
     if data.is_file():
         kinds = f"a video ({', '.join(VIDEO_SUFFIXES)})"
         return UserError(f"{data} is neither a folder nor {kinds}: unpack or convert it, and give the result")

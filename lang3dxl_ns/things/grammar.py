@@ -60,13 +60,15 @@ class Request:
     relation: str | None = None
     others: tuple[Request, ...] = ()
     """What the relation refers to: *the portal*, *the highest tower*."""
+    among: Request | None = None
+    """Things to which they must belong too: *and left of the dome*."""
     without: Request | None = None
     """Things that are left out: *not doors*, *not on the tower*."""
 
     @property
     def parts(self) -> list[Request]:
-        """The request, what it leaves out, and what its relation refers to, all the way down."""
-        inner = [self.without, *self.others] if self.without else self.others
+        """The request and those inside it, all the way down."""
+        inner = filter(None, (self.without, self.among, *self.others))
         return [self, *(part for other in inner for part in other.parts)]
 
     @property
@@ -164,10 +166,13 @@ def meant(name: str, names: Iterable[str] = ()) -> str | None:
 
 def _request(rest: str, restored: Callable[[str], str]) -> Request:
     words = table()
-    left_out, relation, others = None, None, tuple[Request, ...]()
-    if found := re.fullmatch(r"(.+?),? (?:but )?not ((?!.* not ).+)", rest):
+    left_out, also, relation, others = None, None, None, tuple[Request, ...]()
+    relations = _any(words["relations"])
+    if found := re.fullmatch(rf"(.+?),? and ((?:{relations}) .+)", rest):
+        rest, also = found[1], found[2]
+    if found := re.fullmatch(r"(.+?),? (?:but |and )?not ((?!.* not ).+)", rest):
         rest, left_out = found[1], found[2]
-    found = re.fullmatch(rf"(.+?) ({_any(words['relations'])}) (.+)", rest)
+    found = re.fullmatch(rf"(.+?) ({relations}) (.+)", rest)
     if found and _plain(found[3]) not in words["from"]:  # *on the left* names no thing
         rest, relation = found[1], words["relations"][found[2]]
         others = tuple(_request(part, restored) for part in re.split(r"\s+and\s+", found[3]))
@@ -188,10 +193,11 @@ def _request(rest: str, restored: Callable[[str], str]) -> Request:
         raise UserError(f"{place} {rest}: say from which side, such as the {place} {rest} from the left")
     if along and (superlative or not nth):
         raise UserError(f"{whole}: say which one, such as the second from the {along}")
-    if left_out and re.match(rf"(?:{_any(words['relations'])}) ", left_out):
+    if left_out and re.match(rf"(?:{relations}) ", left_out):
         left_out = f"{rest} {left_out}"  # *windows not on the tower*: without windows on the tower
+    among = _request(f"{rest} {also}", restored) if also else None
     without = _request(left_out, restored) if left_out else None
-    return Request(restored(rest), False, superlative, nth, along, relation, others, without)
+    return Request(restored(rest), False, superlative, nth, along, relation, others, among, without)
 
 
 def _check_name(name: str) -> None:
@@ -217,6 +223,9 @@ def answer(request: Request, found: Sequence[Things], view: Sight) -> list[Thing
     if request.without:
         gone = {thing.id for thing in answer(request.without, found, view)}
         chosen = [thing for thing in chosen if thing.id not in gone]
+    if request.among:
+        both = {thing.id for thing in answer(request.among, found, view)}
+        chosen = [thing for thing in chosen if thing.id in both]
     if request.relation:
         others = [answer(other, found, view) for other in request.others]
         if missing := [other.word for other, there in zip(request.others, others, strict=True) if not there]:

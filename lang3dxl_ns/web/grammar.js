@@ -8,7 +8,8 @@ const has = (table, word) => Object.hasOwn(table, word), listed = (phrases) => (
 const any = (...kinds) => kinds.flatMap(listed).sort((a, b) => b.length - a.length).join("|");
 const plain = (text) => text.trim().replace(new RegExp(`^(?:(?:${any(language.articles)})(?:\\s+|$))+`), "");
 
-/** Parse a question: { word, count, superlative, nth, along, relation, others: what it refers to, without: what it leaves out }. Quotes hold
+/** Parse a question: { word, count, superlative, nth, along, relation, others: what it refers to, among: what they must
+ * belong to too, without: what it leaves out }. Quotes hold
  * a phrase, and so do names, which were taught. Throws an error, which names the part, for what the grammar doesn't know. */
 export function parse(text, names = []) {
   const { rest, count, restored } = opened(text, names);
@@ -36,10 +37,13 @@ function opened(text, names) {
 }
 
 function request(rest, restored) {
-  const asked = { word: "", count: false, superlative: null, nth: null, along: null, relation: null, others: [], without: null };
-  let leftOut = null, found = /^(.+?),? (?:but )?not ((?!.* not ).+)$/.exec(rest);
+  const asked = { word: "", count: false, superlative: null, nth: null, along: null, relation: null, others: [], among: null, without: null };
+  const relations = any(grammar.relations);
+  let leftOut = null, also = null, found = new RegExp(`^(.+?),? and ((?:${relations}) .+)$`).exec(rest);
+  if (found) [rest, also] = [found[1], found[2]];
+  found = /^(.+?),? (?:but |and )?not ((?!.* not ).+)$/.exec(rest);
   if (found) [rest, leftOut] = [found[1], found[2]];
-  found = new RegExp(`^(.+?) (${any(grammar.relations)}) (.+)$`).exec(rest);
+  found = new RegExp(`^(.+?) (${relations}) (.+)$`).exec(rest);
   if (found && !has(grammar.from, plain(found[3]))) {
     [rest, asked.relation, asked.others] = [found[1], grammar.relations[found[2]], found[3].split(/\s+and\s+/).map((part) => request(part, restored))];
     if (asked.others.length > (asked.relation === "between" ? 2 : 1)) throw new Error(`${found[2]} ${found[3]}: name one thing, or two with between … and …`);
@@ -55,8 +59,8 @@ function request(rest, restored) {
   checkName(restored(rest) && rest); // quotes may hold nothing
   if (asked.nth && !asked.along && !noun) throw new Error(`${place} ${rest}: say from which side, such as the ${place} ${rest} from the left`);
   if (asked.along && (noun || !asked.nth)) throw new Error(`${whole}: say which one, such as the second from the ${asked.along}`);
-  if (leftOut && new RegExp(`^(?:${any(grammar.relations)}) `).test(leftOut)) leftOut = `${rest} ${leftOut}`; // windows not on the tower: without windows on the tower
-  return { ...asked, word: restored(rest), without: leftOut && request(leftOut, restored) };
+  if (leftOut && new RegExp(`^(?:${relations}) `).test(leftOut)) leftOut = `${rest} ${leftOut}`; // windows not on the tower: without windows on the tower
+  return { ...asked, word: restored(rest), among: also && request(`${rest} ${also}`, restored), without: leftOut && request(leftOut, restored) };
 }
 
 const KINDS = ["asks", "unknown", "ordinals", "superlatives", "from", "relations"].map((kind) => grammar[kind]);
@@ -78,8 +82,7 @@ const ASKS = new RegExp(`^(?:${any(grammar.ordinals)}|\\d+(?:st|nd|rd|th)) |${wh
  * phrases that hold such words and are none. */
 export function isQuestion(text, names = [], known = []) {
   try {
-    const { without, ...asked } = parse(text, names);
-    return [asked, without].some((part) => part?.count || part?.superlative || part?.nth || part?.relation);
+    return partsOf(parse(text, names)).some(({ count, superlative, nth, relation }) => count || superlative || nth || relation);
   } catch {
     const { rest, count } = opened(text, names);
     return !known.includes(text.trim().toLowerCase()) && (count || ASKS.test(plain(rest)));
@@ -87,18 +90,22 @@ export function isQuestion(text, names = [], known = []) {
 }
 
 const orderOf = ({ superlative, along }) => grammar.superlatives[superlative] ?? grammar.from[along] ?? ["", 0];
-const partsOf = (request) => [request, ...[request.without, ...request.others].flatMap((part) => (part ? partsOf(part) : []))];
+const partsOf = (request) => [request, ...[request.without, request.among, ...request.others].flatMap((part) => (part ? partsOf(part) : []))];
 export const wordsOf = (request) => [...new Set(partsOf(request).map(({ word }) => word))];
 
 /** Choose the things that a request asks for. things: those of each word; view: { right, up, ahead, shown: ids of the
  * things that one sees, which alone are numbered from left to right; none: all }. Throws an error if a thing that the relation
  * refers to is not found, or if there are fewer than the ordinal asks for. */
 export function answerTo(request, things, view) {
-  const { word, relation, others, nth, without } = request;
+  const { word, relation, others, nth, among, without } = request;
   let chosen = things[word], where = "";
   if (without) {
     const gone = answerTo(without, things, view);
     chosen = chosen.filter(({ id }) => !gone.some((other) => other.id === id));
+  }
+  if (among) {
+    const both = answerTo(among, things, view);
+    chosen = chosen.filter(({ id }) => both.some((other) => other.id === id));
   }
   if (relation) {
     const there = others.map((other) => answerTo(other, things, view)), missing = there.findIndex((some) => !some.length);

@@ -147,7 +147,7 @@ export class List extends EventTarget {
     for (const [k, word] of words.entries()) found[word] = await this.find(asked[k]);
     const things = Object.fromEntries(words.map((word) => [word, found[word].things])), own = things[request.word];
     const view = await this.sight(Object.values(found)), chosen = answerTo(request, things, view), [first] = asked, every = chosen.length === own.length;
-    const counted = request.count && !(request.relation || request.superlative || request.nth || request.without);
+    const counted = request.count && !(request.relation || request.superlative || request.nth || request.among || request.without);
     Object.assign(first, { listed: true, asked: every ? null : new Set(chosen.map(({ id }) => id)) });
     const sure = asked.every(({ trust }) => trust.level === "sure" && !trust.far) ? "" : " Not sure: see the cards.";
     const doubt = counted ? null : unsure(request, found, view, shown), several = assumed(request, things, view, shown);

@@ -331,6 +331,9 @@ def test_links_to_folders_and_folders_that_may_not_be_read_are_told(tmp_path, ca
 @pytest.mark.parametrize("name", ["takeout.zip", "old.wmv"])
 def test_a_file_that_is_no_folder_of_photos_is_told_with_the_way_out(tmp_path, name):
     (tmp_path / name).touch()
+    (tmp_path / "one.jpg").touch()
     for look in (find_photos, check_data):
         with pytest.raises(UserError, match=rf"{name} is neither a folder nor a video .*unpack or convert"):
             look(tmp_path / name)
+        with pytest.raises(UserError, match=rf"one photo: give the folder that holds it .*{tmp_path.name}"):
+            look(tmp_path / "one.jpg")

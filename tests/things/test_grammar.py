@@ -84,7 +84,9 @@ ON_TOWER = Request("windows", relation="in", others=(Request("tower"),))
          Request("doors and gates", True, without=Request("'a' door"))),
         ("windows that are not on the tower", Request("windows", without=ON_TOWER)),
         ("highest windows above the portal but not on the tower",
-         Request("windows", False, "highest", None, None, "above", (Request("portal"),), ON_TOWER)),
+         Request("windows", False, "highest", None, None, "above", (Request("portal"),), None, ON_TOWER)),
+        ("largest windows above the portal, and on the tower",
+         Request("windows", False, "largest", None, None, "above", (Request("portal"),), ON_TOWER)),
         ('"top" windows above the "left gate"',
          Request("top windows", relation="above", others=(Request("left gate"),))),
     ],
@@ -178,6 +180,8 @@ def test_questions_choose_by_place_and_size_and_mirror_with_the_viewer():
     assert ids("window not left of the portal") == [2, 3]  # the rest of those that are
     assert ids("leftmost window not left of the portal") == [3]
     assert ids("window above the portal, but not left of the right window") == [2]
+    assert ids("window right of the leftmost window and left of the rightmost window") == [0, 3]
+    assert ids("window above the portal and left of the portal and not right of the portal") == [0, 1]
     assert ids("second highest window") == ids("second largest window") == [1]  # in their order
     with pytest.raises(UserError, match="only 4"):
         ids("fifth window from the left")

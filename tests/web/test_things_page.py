@@ -57,6 +57,7 @@ QUESTIONS = [
     *("the second-highest window", "left-most tower", "2nd-largest dome", "what is the number of windows"),
     *("the number of windows", "how many of the windows are above the dome", "twelfth window from the left"),
     *("windows not on the tower", "highest window left of the door but not above it", "windows, not a not b"),
+    *("largest windows above the portal and on the tower, and left of the dome", "a between b and in c"),
     *("how many windows are not above the highest door", "windows, but not doors above the portal"),
     *("windows directly above the dome", 'how many ""', 'windows above ""', 'windows not " "', "tower-left"),
 ]
