@@ -123,7 +123,7 @@ def _parsed(words: Sequence[str]) -> Any:
     _check_no_empty(words)
     _check_name(COMMANDS, words)
     _check_once(words)
-    words = with_data_as_taken(with_all_texts(words))
+    words = with_place_as_taken(with_all_texts(words))
     try:
         config = (tyro.conf.OmitArgPrefixes,)
         parsed = tyro.cli(
@@ -156,11 +156,17 @@ def with_all_texts(words: Sequence[str]) -> list[str]:
     return given
 
 
-def with_data_as_taken(words: Sequence[str]) -> list[str]:
-    """Spell the folder of photos as its command takes it: `train FOLDER`, but `reconstruct --data FOLDER`.
-    People write either for both."""
-    if words[:1] == ["train"]:
-        return [word.removeprefix("--data=") for word in words if word != "--data"]
+_NAMED = {"train": ("--data",)} | dict.fromkeys(
+    ("query", "things", "export", "teach", "words", "info", "view"), ("--scene", "--load-config")
+)
+"""Names that people give to the place that a command takes without one, such as those of nerfstudio."""
+
+
+def with_place_as_taken(words: Sequence[str]) -> list[str]:
+    """Spell the folder of photos, or the scene, as its command takes it: `train FOLDER`, `query SCENE`, but
+    `reconstruct --data FOLDER`. People write either for all."""
+    for name in _NAMED.get("".join(words[:1]), ()):
+        words = [word.removeprefix(f"{name}=") for word in words if word != name]
     named = words[:1] and words[0] in ("reconstruct", "prepare", "needs")
     if named and words[1:] and not words[1].startswith("-"):
         return [words[0], "--data", *words[1:]]

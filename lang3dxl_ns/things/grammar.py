@@ -168,7 +168,7 @@ def _request(rest: str, restored: Callable[[str], str]) -> Request:
     words = table()
     left_out, also, relation, others = None, None, None, tuple[Request, ...]()
     relations = _any(words["relations"])
-    if found := re.fullmatch(rf"(.+?),? and ((?:{relations}) .+)", rest):
+    if found := re.fullmatch(rf"(.+?),? and ((?:not )?(?:{relations}) .+)", rest):
         rest, also = found[1], found[2]
     if found := re.fullmatch(r"(.+?),? (?:but |and )?not ((?!.* not ).+)", rest):
         rest, left_out = found[1], found[2]

@@ -39,7 +39,7 @@ function opened(text, names) {
 function request(rest, restored) {
   const asked = { word: "", count: false, superlative: null, nth: null, along: null, relation: null, others: [], among: null, without: null };
   const relations = any(grammar.relations);
-  let leftOut = null, also = null, found = new RegExp(`^(.+?),? and ((?:${relations}) .+)$`).exec(rest);
+  let leftOut = null, also = null, found = new RegExp(`^(.+?),? and ((?:not )?(?:${relations}) .+)$`).exec(rest);
   if (found) [rest, also] = [found[1], found[2]];
   found = /^(.+?),? (?:but |and )?not ((?!.* not ).+)$/.exec(rest);
   if (found) [rest, leftOut] = [found[1], found[2]];

@@ -137,6 +137,14 @@ def test_a_folder_of_photos_is_taken_with_and_without_its_options_name(command, 
     assert cli._parsed([command, *spelled]).data == Path("photos")
 
 
+@pytest.mark.parametrize("command", ["query", "things", "export", "teach", "words", "info", "view"])
+@pytest.mark.parametrize("spelled", [["a b"], ["--scene", "a b"], ["--load-config=a b"]])
+def test_a_scene_is_taken_with_and_without_an_options_name(command, spelled):
+    assert cli.with_place_as_taken([command, *spelled]) == [command, "a b"]
+    if command != "teach":  # which wants a word too
+        assert cli._parsed([command, *spelled]).scene == Path("a b")
+
+
 def test_a_port_that_is_taken_is_not_replaced_silently():
     with (
         socket.create_server(("127.0.0.1", 0)) as server,

@@ -182,6 +182,7 @@ def test_questions_choose_by_place_and_size_and_mirror_with_the_viewer():
     assert ids("window above the portal, but not left of the right window") == [2]
     assert ids("window right of the leftmost window and left of the rightmost window") == [0, 3]
     assert ids("window above the portal and left of the portal and not right of the portal") == [0, 1]
+    assert ids("window not left of the portal and not left of the right window") == [2]
     assert ids("second highest window") == ids("second largest window") == [1]  # in their order
     with pytest.raises(UserError, match="only 4"):
         ids("fifth window from the left")

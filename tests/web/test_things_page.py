@@ -58,6 +58,7 @@ QUESTIONS = [
     *("the number of windows", "how many of the windows are above the dome", "twelfth window from the left"),
     *("windows not on the tower", "highest window left of the door but not above it", "windows, not a not b"),
     *("largest windows above the portal and on the tower, and left of the dome", "a between b and in c"),
+    *("a not left of b and not right of c", "windows and not doors", "windows above the door and not arches"),
     *("how many windows are not above the highest door", "windows, but not doors above the portal"),
     *("windows directly above the dome", 'how many ""', 'windows above ""', 'windows not " "', "tower-left"),
 ]
