@@ -59,7 +59,7 @@ def read_splats(path: str | Path) -> Splats:
     keep their place, but lose their size and opacity. Raises UserError if the file is missing, damaged, too
     large for this machine or of another kind, or most of its values are not finite."""
     path = find_splats(path)
-    reader = _READERS.get(path.suffix.lower())
+    reader = _reader(path)
     if reader is None:
         told = f"has an unsupported format: give {KINDS}; SuperSplat makes a .ply of others"
         if path.suffix == SUFFIX:
@@ -82,6 +82,14 @@ def read_splats(path: str | Path) -> Splats:
         reason = in_a_line(error)
         raise UserError(f"{path} is damaged or incomplete ({reason}): copy or export it again") from error
     return _finite(splats, path)
+
+
+def _reader(path: Path) -> Callable[[Path], Splats] | None:
+    """Find the reader of a file: that of its first bytes, since people rename files, or of its ending."""
+    with path.open("rb") as file:
+        start = file.read(4)
+    kind = next((kind for first, kind in _BEGINNINGS.items() if start.startswith(first)), path.suffix.lower())
+    return _READERS.get(kind)
 
 
 def _joined(parts: list[Splats]) -> Splats:
@@ -136,3 +144,4 @@ _READERS: dict[str, Callable[[Path], Splats]] = {
     **{".ply": read_ply, ".spz": read_spz, ".splat": _splat, ".sog": read_sog, ".glb": read_glb},
     **{".pt": read_checkpoint, ".pth": read_checkpoint, ".ckpt": read_checkpoint},
 }
+_BEGINNINGS = {b"ply\n": ".ply", b"ply\r": ".ply", b"glTF": ".glb", b"NGSP": ".spz", b"\x1f\x8b\x08": ".spz"}

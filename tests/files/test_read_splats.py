@@ -243,6 +243,15 @@ def test_a_splat_of_the_web_is_read(tmp_path):
     assert_alike(read_splats(tmp_path / "a.splat"), splats, opacities=3e-3, colors=0.01, turn=1e-4)
 
 
+@pytest.mark.parametrize("ending", [".ply", ".spz", ".glb"])
+@pytest.mark.parametrize("named", ["a.splat", "a.spz", "b.ply", "a.txt", "a"])
+def test_a_file_is_what_its_first_bytes_say_whatever_its_name(ending, named, tmp_path):
+    write_splats(tmp_path / f"true{ending}", some_splats())
+    (tmp_path / named).write_bytes((tmp_path / f"true{ending}").read_bytes())
+    found, expected = (read_splats(tmp_path / name) for name in (named, f"true{ending}"))
+    assert_alike(found, expected)
+
+
 def test_a_run_folder_means_its_latest_splat(tmp_path):
     for step in (7_000, 30_000, 9_000):
         place = tmp_path / "point_cloud" / f"iteration_{step}"
