@@ -40,13 +40,12 @@ def name_finder(files: Iterable[str]) -> Callable[[str], list[str]]:
         by_stem[Path(last).stem].append(file)
 
     def find(name: str) -> list[str]:
-        if not (parts := normal_parts(name)):
-            return []
-        *folders, last = parts
-        fitting = by_name.get(last) or by_stem.get(last) or by_stem.get(Path(last).stem, [])
-        if not fitting and (written := unquote(name)) != name:  # as in addresses: my%20photo.jpg
-            return find(written)
-        return _deepest(tuple(folders), fitting)
+        for written in (name, unquote(name)):  # as in addresses: my%20photo.jpg
+            *folders, last = normal_parts(written) or ("",)
+            fitting = by_name.get(last) or by_stem.get(last) or by_stem.get(Path(last).stem, [])
+            if fitting:
+                return _deepest(tuple(folders), fitting)
+        return []
 
     return find
 

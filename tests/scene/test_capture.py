@@ -180,6 +180,7 @@ def test_a_binary_model_may_name_removed_photos(folder):
 def test_names_of_other_programs_find_their_file(name, file):
     files = ["a.png", "day1/b.png", "day2/b.png", "caf\u00e9.png", "50%25.png", "50%.png"]
     assert name_finder(files)(name) == [file]
+    assert name_finder(files)(f"%{'25' * 4000}.png") == []  # written so a thousand times over
 
 
 def test_ambiguous_and_shared_names_are_refused_and_exact_ones_keep_their_files(capsys):
