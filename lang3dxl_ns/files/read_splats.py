@@ -19,7 +19,7 @@ from PIL import Image
 
 from lang3dxl_ns.common.checks import expect
 from lang3dxl_ns.common.console import say
-from lang3dxl_ns.common.errors import DAMAGE, UserError, in_a_line, not_of_memory
+from lang3dxl_ns.common.errors import DAMAGE, UserError, in_a_line, not_of_memory, readable
 from lang3dxl_ns.common.files import expanded
 from lang3dxl_ns.files.activations import check_memory, tensor_of
 from lang3dxl_ns.files.checkpoints import read_checkpoint
@@ -86,7 +86,7 @@ def read_splats(path: str | Path) -> Splats:
 
 def _reader(path: Path) -> Callable[[Path], Splats] | None:
     """Find the reader of a file: that of its first bytes, since people rename files, or of its ending."""
-    with path.open("rb") as file:
+    with readable(f"{path} can't be opened", "allow it, or copy it again"), path.open("rb") as file:
         start = file.read(4)
     kind = next((kind for first, kind in _BEGINNINGS.items() if start.startswith(first)), path.suffix.lower())
     return _READERS.get(kind)

@@ -209,8 +209,9 @@ def photos_below(folder: Path) -> list[str]:
         ours = _results(Path(parent), files)
         pictures = [
             file
-            for file in set(files) - ours
+            for file in files
             if Path(file).suffix.lower() in _KNOWN and not file.startswith(".") and not _OWN.search(file)
+            if file not in ours
         ]
         lower = {name for file in pictures for name in (file.casefold(), Path(file).stem.casefold())}
         for file in pictures:
