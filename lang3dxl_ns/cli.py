@@ -110,6 +110,7 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 _TEXTS = "Texts follow --text: lang3dxl {} RUN --text windows{}"
+_THINGS = "Single things, with their boxes: lang3dxl things RUN --text windows --out DIR"
 _PLACES = (".scene", ".glb", ".spz", ".yml", ".ply", ".sog", ".splat", ".pt", ".ckpt")
 """Endings of what holds a scene or a splat."""
 _REPEATED = ("--text", "--ask", "--not", "--segment", "--forget")
@@ -131,7 +132,8 @@ def _parsed(words: Sequence[str]) -> Any:
         )
     except SystemExit as error:
         if error.code == 2 and words[0] in ("query", "export"):
-            print(_TEXTS.format(words[0], "" if words[0] == "query" else " --out found.ply"), file=sys.stderr)
+            told = _TEXTS.format(words[0], "" if words[0] == "query" else " --out found.ply")
+            print(_THINGS if "--things" in words else told, file=sys.stderr)
         raise
     # Shells leave the ~ of --out=~/found as it is.
     vars(parsed).update({name: expanded(v) for name, v in vars(parsed).items() if isinstance(v, Path)})
@@ -165,7 +167,7 @@ _NAMED = {"train": ("--data",)} | dict.fromkeys(
 def with_place_as_taken(words: Sequence[str]) -> list[str]:
     """Spell the folder of photos, or the scene, as its command takes it: `train FOLDER`, `query SCENE`, but
     `reconstruct --data FOLDER`. People write either for all."""
-    for name in _NAMED.get("".join(words[:1]), ()):
+    for name in _NAMED.get(next(iter(words), ""), ()):
         words = [word.removeprefix(f"{name}=") for word in words if word != name]
     named = words[:1] and words[0] in ("reconstruct", "prepare", "needs")
     if named and words[1:] and not words[1].startswith("-"):

@@ -81,6 +81,9 @@ def test_a_text_without_its_flag_is_told(capsys):
     with pytest.raises(SystemExit, match="2"):
         cli.main(["query", "run", "windows", "--out", "found"])
     assert "Texts follow --text" in capsys.readouterr().err
+    with pytest.raises(SystemExit, match="2"):
+        cli.main(["query", "run", "--text", "windows", "--things"])
+    assert "lang3dxl things RUN" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
