@@ -209,12 +209,17 @@ def test_left_and_right_are_told_among_what_the_view_shows():
         ids("leftmost window")
 
 
-def test_left_and_right_in_a_photo_are_told_among_what_it_shows():
+def seen_from_behind_too():
+    """A scene with a further photo that looks the other way: with its first photo, and this one."""
     plain = painted_file()
     first = plain.photos[0]
     turned = [[-row[0], row[1], -row[2], row[3]] for row in first.camera_to_world]
     away = replace(first, name="away.jpg", camera_to_world=turned)
-    scene = painted_scene(file=replace(plain, photos=[*plain.photos, away]))
+    return painted_scene(file=replace(plain, photos=[*plain.photos, away])), first, away
+
+
+def test_left_and_right_in_a_photo_are_told_among_what_it_shows():
+    scene, first, away = seen_from_behind_too()
     windows = scene.things("windows")[0].things
     assert sight_of(scene, windows, first.name).shown == {one.id for one in windows}
     # Whether it was found in a photo, as in none of those that were held out, makes no difference.
@@ -226,18 +231,14 @@ def test_left_and_right_in_a_photo_are_told_among_what_it_shows():
 
 def test_one_photo_tells_left_and_right_in_a_whole_question():
     """The one that shows most of what is asked for, whatever shows most of what it refers to."""
-    plain = painted_file()
-    first = plain.photos[0]
-    turned = [[-row[0], row[1], -row[2], row[3]] for row in first.camera_to_world]
-    back = replace(first, name="back.jpg", camera_to_world=turned)
-    scene = painted_scene(file=replace(plain, photos=[*plain.photos, back]))
+    scene, first, back = seen_from_behind_too()
     box = (0, 0, 9, 9)
     windows = [
         replace(thing(i, "window", (x, 0, 0)), sightings=[Sighting(first.name, box)])
         for i, x in enumerate((0, 3))
     ]
     doors = [
-        replace(thing(i, "door", (x, 0, 0)), sightings=[Sighting("back.jpg", box)])
+        replace(thing(i, "door", (x, 0, 0)), sightings=[Sighting(back.name, box)])
         for i, x in ((5, -3), (6, 6))
     ]
     found = [Things("window", windows), Things("door", doors)]
